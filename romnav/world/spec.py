@@ -1,0 +1,45 @@
+"""Configuration of the world."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from romnav.config import Config
+
+
+class GridSpec(Config):
+    """How solids become occupancy grids."""
+
+    cell: float = 0.2
+    """Cell side, m (P)."""
+    robot_radius: float = 0.3
+    """Radius by which obstacles and drop-offs are inflated, m (A: half the width of a G1 with its arms)."""
+    robot_height: float = 1.4
+    """Clearance that the robot needs above the walking surface, m (A: a G1 stands 1.32 m tall)."""
+    max_step: float = 0.25
+    """Height difference between neighbouring cells that is still walked over, m (A: above the highest riser)."""
+
+
+class WorldSpec(Config):
+    """A set of tiles made from one seed."""
+
+    tiles: int = 48
+    """Number of tiles; classes take turns."""
+    seed: int = 0
+    """Seed of the generator; evaluation uses another one (P)."""
+    side: float = 20.0
+    """Tile side, m (A)."""
+    classes: tuple[str, ...] = ("building", "outdoor", "building", "room")
+    """Tile classes in turn (A: half of the tiles are multi-story, where the paper's question lies)."""
+    riser: tuple[float, float] = (0.10, 0.18)
+    """Range of stair risers, m (A)."""
+    tread: tuple[float, float] = (0.26, 0.32)
+    """Range of stair treads, m (A)."""
+    storey_height: float = 4.0
+    """Height between floors, m (P)."""
+    max_storeys: int = Field(default=3, ge=1, le=3)
+    """Most floors of a building (P)."""
+    goals_per_tile: int = 96
+    """Goal cells per tile, each with its own geodesic field (A: memory, 2 bytes per free cell and goal)."""
+    grid: GridSpec = GridSpec()
+    """Occupancy grids."""
