@@ -1,0 +1,91 @@
+"""Navigation metrics as ratios of sums over episodes.
+
+Every metric is ``scale * sum(numerator) / sum(denominator)``: a mean over the episodes (success rate, SPL), over the
+successes (time to goal) or over the metres walked (collisions). That makes one resample of the sums a resample of
+every metric.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from romnav.evaluation.rows import HORIZONS, SUCCESS_RADIUS
+
+Level = Literal["all", "same", "cross"]
+LEVELS: tuple[Level, ...] = ("all", "same", "cross")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric: ``scale * sum(numerator) / sum(denominator)``, both named quantities of an episode."""
+
+    numerator: str
+    denominator: str = "episodes"
+    scale: float = 1.0
+
+
+METRICS: dict[str, Metric] = {
+    **{f"sr_{horizon}": Metric(f"reached_{horizon}", scale=100.0) for horizon in HORIZONS},
+    "t2g": Metric("time_to_goal", "reached_120"),
+    "spl": Metric("spl"),
+    "soft_spl": Metric("soft_spl"),
+    "rmt": Metric("restricted_time"),
+    "falls": Metric("falls", scale=100.0),
+    "timeouts": Metric("timeouts", scale=100.0),
+    "collisions": Metric("collisions", "path", scale=100.0),
+}
+"""Success rates, falls and timeouts in percent; mean time to goal over successes (t2g) and restricted mean time with
+failures at 120 s (rmt) in s; SPL (Anderson et al. 2018) and SoftSPL (Datta et al. 2020) in 0..1; collisions per 100 m."""
+
+
+def quantities(columns: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """What each episode adds to the sums of the metrics.
+
+    Args:
+        columns: Columns of episode rows, of one common shape.
+
+    Returns:
+        Name to array of that shape.
+    """
+    time = columns["success_time"]
+    reached = {horizon: (time <= horizon).astype(float) for horizon in HORIZONS}
+    geodesic, path = columns["geodesic"], columns["path_length"]
+    longest = np.maximum(geodesic, path)
+    efficiency = np.divide(geodesic, longest, out=np.ones_like(longest), where=longest > 0)
+    # A goal inside the success radius leaves no progress to divide by.
+    progress = np.clip(1 - columns["final_distance"] / np.maximum(geodesic, SUCCESS_RADIUS), 0, None)
+    return {
+        "episodes": np.ones_like(time),
+        **{f"reached_{horizon}": hit for horizon, hit in reached.items()},
+        "time_to_goal": np.nan_to_num(time, nan=0.0),
+        "restricted_time": np.nan_to_num(time, nan=HORIZONS[-1]),
+        "spl": reached[HORIZONS[-1]] * efficiency,
+        "soft_spl": progress * efficiency,
+        "falls": (columns["outcome"] == "fall").astype(float),
+        "timeouts": (columns["outcome"] == "timeout").astype(float),
+        "collisions": columns["collisions"].astype(float),
+        "path": path,
+    }
+
+
+def in_level(columns: Mapping[str, NDArray], level: Level) -> NDArray:
+    """Mask of the episodes whose goal lies on the spawn's level, on another, or of all."""
+    return np.ones(columns["level"].shape, bool) if level == "all" else columns["level"] == level
+
+
+def evaluate(columns: Mapping[str, NDArray], level: Level = "all") -> dict[str, float]:
+    """Every metric of ``METRICS`` over the episodes of a level; NaN where there is nothing to average."""
+    mask = in_level(columns, level)
+    sums = {name: float(values[mask].sum()) for name, values in quantities(columns).items()}
+    return {name: ratio(metric, sums) for name, metric in METRICS.items()}
+
+
+def ratio(metric: Metric, sums: Mapping[str, float]) -> float:
+    """A metric from the sums of the quantities; NaN where the denominator is zero."""
+    denominator = sums[metric.denominator]
+    return metric.scale * sums[metric.numerator] / denominator if denominator else float("nan")

@@ -1,0 +1,262 @@
+"""Episode rows: one parquet file per arm and training seed, one row per evaluation episode.
+
+Rows are all that evaluation hands on: metrics, tables and figures are pure functions of them.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
+
+from romnav.config import Config
+from romnav.errors import RomnavError
+
+SCHEMA_VERSION = 1
+HORIZONS = (45, 120)
+"""Evaluation horizons, s (paper, Sec. IV-A): the training budget, and the end of an episode."""
+SUCCESS_RADIUS = 0.5
+"""Distance to the goal that counts as success, m (paper, Sec. IV-A)."""
+OUTCOMES = ("success", "fall", "timeout")
+TILE_CLASSES = ("outdoor", "room", "building")
+
+_POSES = [pa.field(f"{end}_{axis}", pa.float64()) for end in ("spawn", "goal") for axis in ("x", "y", "z", "yaw")]
+SCHEMA = pa.schema(
+    [
+        pa.field("arm", pa.string()),
+        pa.field("seed", pa.int64()),  # of the training run
+        pa.field("episode", pa.int64()),  # 0 .. n - 1
+        pa.field("tile", pa.int64()),
+        pa.field("tile_class", pa.string()),
+        pa.field("multi_story", pa.bool_()),
+        *_POSES,  # m, m, m, rad
+        pa.field("geodesic", pa.float64()),  # planar length of the shortest path from spawn to goal, m
+        pa.field("level", pa.string()),  # "same" or "cross": does the goal lie on another level
+        pa.field("success_time", pa.float64()),  # first time within SUCCESS_RADIUS in 3D, s; NaN if never
+        pa.field("outcome", pa.string()),
+        pa.field("time", pa.float64()),  # at which the episode ended, s
+        pa.field("path_length", pa.float64()),  # planar, sampled at 5 Hz until the end, m
+        pa.field("final_distance", pa.float64()),  # geodesic distance to the goal at the end, m; may be infinite
+        pa.field("collisions", pa.int64()),  # steps with contact
+    ]
+)
+
+
+class Provenance(Config):
+    """Where a file of rows comes from."""
+
+    scale: str
+    """Scale of the run: smoke, cpu or paper."""
+    commit: str
+    """Git commit of the code that evaluated."""
+    spec_hash: str
+    """Hash of the arm's resolved specification."""
+    checkpoint_sha256: str | None
+    """Hash of the evaluated checkpoint; none for a scripted arm."""
+    episode_set: str
+    """Hash of the set of initial conditions."""
+    version: str
+    """Version of romnav."""
+    steps: int
+    """Environment steps of training; 0 for a scripted arm."""
+    hours: float
+    """Wall-clock time of training, h."""
+    machine: str
+    """Processor or GPU, and the operating system."""
+
+
+@dataclass(frozen=True)
+class EpisodeRows:
+    """The rows of one evaluated arm and training seed, in order of the episode id.
+
+    Attributes:
+        columns: Name to array of shape (n,), see ``SCHEMA``.
+        provenance: Where the rows come from.
+        source: The file they were read from (or will be called by in an error).
+    """
+
+    columns: Mapping[str, NDArray]
+    provenance: Provenance
+    source: str = "rows"
+
+    @property
+    def arm(self) -> str:
+        """Name of the arm."""
+        return str(self.columns["arm"][0])
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training run."""
+        return int(self.columns["seed"][0])
+
+    def __len__(self) -> int:
+        return len(self.columns["episode"])
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm over its training seeds, all evaluated on the same episodes."""
+
+    name: str
+    runs: tuple[EpisodeRows, ...]
+
+    def stack(self, column: str) -> NDArray:
+        """A column of every training seed, shape (seeds, n)."""
+        return np.stack([run.columns[column] for run in self.runs])
+
+
+def make(columns: Mapping[str, ArrayLike], provenance: Provenance, source: str = "rows") -> EpisodeRows:
+    """Validates columns and puts them in order of the episode id.
+
+    Raises:
+        RomnavError: A column is missing, has another type, or holds impossible values.
+    """
+    if missing := [name for name in SCHEMA.names if name not in columns]:
+        raise RomnavError(f"{source}: column(s) {', '.join(missing)} missing; evaluate the arm again")
+    if unknown := sorted(set(columns) - set(SCHEMA.names)):
+        raise RomnavError(f"{source}: unknown column(s) {', '.join(unknown)}")
+    arrays: dict[str, NDArray] = {}
+    for field in SCHEMA:
+        array = np.asarray(columns[field.name])
+        kind = {"string": "OUT", "bool": "b", "int64": "iu", "double": "fiu"}[str(field.type)]
+        if array.ndim != 1 or array.dtype.kind not in kind:
+            raise RomnavError(f"{source}: column {field.name} must be a list of {field.type}, not {array.dtype}")
+        arrays[field.name] = array.astype(object if kind == "OUT" else field.type.to_pandas_dtype())
+    if len({len(array) for array in arrays.values()}) != 1 or not len(arrays["episode"]):
+        raise RomnavError(f"{source}: columns are empty or of different lengths; evaluate the arm again")
+    order = np.argsort(arrays["episode"], kind="stable")
+    arrays = {name: array[order] for name, array in arrays.items()}
+    _check(arrays, source)
+    return EpisodeRows(arrays, provenance, source)
+
+
+def _check(c: Mapping[str, NDArray], source: str) -> None:
+    episodes, n = c["episode"], len(c["episode"])
+    repeated = np.unique(episodes[:-1][np.diff(episodes) == 0])
+    if len(repeated):
+        raise RomnavError(f"{source}: episode(s) {_some(repeated)} occur twice; evaluate the arm again")
+    if not np.array_equal(episodes, np.arange(n)):
+        missing = np.setdiff1d(np.arange(episodes[-1] + 1), episodes)
+        raise RomnavError(f"{source}: episode(s) {_some(missing)} missing; evaluate the arm again")
+    success = np.isfinite(c["success_time"])
+    finite = [name for name in SCHEMA.names if c[name].dtype.kind == "f" and name not in ("success_time", "final_distance")]
+    holds: dict[str, Any] = {
+        "arm": c["arm"] == c["arm"][0],
+        "seed": c["seed"] == c["seed"][0],
+        "tile_class": np.isin(c["tile_class"], TILE_CLASSES),
+        "level": np.isin(c["level"], ("same", "cross")),
+        "outcome": np.isin(c["outcome"], OUTCOMES) & ((c["outcome"] == "success") == success),
+        "success_time": np.isnan(c["success_time"]) | ((c["success_time"] >= 0) & (c["success_time"] <= HORIZONS[-1])),
+        "final_distance": c["final_distance"] >= 0,
+        "collisions": c["collisions"] >= 0,
+        **{name: np.isfinite(c[name]) for name in finite},
+    }
+    for name in ("geodesic", "time", "path_length"):
+        holds[name] = holds[name] & (c[name] >= 0)
+    for name, ok in holds.items():
+        if not np.all(ok):
+            worst = int(np.argmin(ok))
+            raise RomnavError(
+                f"{source}: episode {episodes[worst]} has the impossible {name} {c[name][worst]!r}; evaluate the arm again"
+            )
+
+
+def _some(ids: NDArray) -> str:
+    shown = ", ".join(str(i) for i in ids[:3])
+    return shown if len(ids) <= 3 else f"{shown}, ... ({len(ids)} in all)"
+
+
+def write(path: Path, rows: EpisodeRows) -> None:
+    """Writes rows to a parquet file, whole or not at all.
+
+    Raises:
+        RomnavError: The folder cannot be written or the disk is full.
+    """
+    metadata = {"romnav.rows": str(SCHEMA_VERSION), "romnav.provenance": rows.provenance.model_dump_json()}
+    table = pa.table(dict(rows.columns), schema=SCHEMA.with_metadata(metadata))
+    part = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        with os.fdopen(handle, "wb") as file:
+            pq.write_table(table, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        if part is not None:
+            Path(part).unlink(missing_ok=True)
+        raise RomnavError(f"{path}: cannot be written ({error.strerror or error}); free the disk or its permissions") from error
+
+
+def read(path: Path) -> EpisodeRows:
+    """Reads and validates rows.
+
+    Raises:
+        RomnavError: The file is missing, truncated, of another schema, or its rows are impossible.
+    """
+    again = "evaluate the arm again"
+    try:
+        table = pq.ParquetFile(path).read()
+    except FileNotFoundError as error:
+        raise RomnavError(f"{path}: no such file of episode rows; evaluate the arm first") from error
+    except (OSError, pa.ArrowException) as error:
+        raise RomnavError(f"{path}: not a readable parquet file (truncated?); {again}") from error
+    metadata = table.schema.metadata or {}
+    version = metadata.get(b"romnav.rows", b"none").decode()
+    if version != str(SCHEMA_VERSION):
+        raise RomnavError(f"{path}: rows of schema version {version}, not {SCHEMA_VERSION}; {again}")
+    try:
+        provenance = Provenance.model_validate_json(metadata.get(b"romnav.provenance", b"{}"))
+    except ValidationError as error:
+        key = ".".join(str(part) for part in error.errors()[0]["loc"])
+        raise RomnavError(f"{path}: provenance key {key}: {error.errors()[0]['msg']}; {again}") from error
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    return make(columns, provenance, str(path))
+
+
+def pair(runs: Iterable[EpisodeRows]) -> list[Arm]:
+    """Groups runs into arms (in order of first appearance) and checks that all saw the same episodes.
+
+    Raises:
+        RomnavError: Two runs differ in episode set or in episodes, or one run is given twice.
+    """
+    runs = list(runs)
+    groups: dict[str, dict[int, EpisodeRows]] = {}
+    for run in runs:
+        _same_episodes(runs[0], run)
+        seeds = groups.setdefault(run.arm, {})
+        if run.seed in seeds:
+            raise RomnavError(
+                f"{seeds[run.seed].source} and {run.source}: both hold arm {run.arm}, seed {run.seed}; remove one"
+            )
+        seeds[run.seed] = run
+    return [Arm(name, tuple(seeds[seed] for seed in sorted(seeds))) for name, seeds in groups.items()]
+
+
+def _same_episodes(a: EpisodeRows, b: EpisodeRows) -> None:
+    both = f"{a.source} and {b.source}"
+    if a.provenance.episode_set != b.provenance.episode_set:
+        raise RomnavError(
+            f"{both}: rows of different episode sets ({a.provenance.episode_set} and {b.provenance.episode_set}); "
+            "evaluate both arms on the same set"
+        )
+    if len(a) != len(b):
+        raise RomnavError(
+            f"{both}: {len(a)} and {len(b)} episodes of set {a.provenance.episode_set}; evaluate the shorter one again"
+        )
+    for name in ("tile", "level"):
+        if not np.array_equal(a.columns[name], b.columns[name]):
+            raise RomnavError(
+                f"{both}: episodes differ in {name} although both name set {a.provenance.episode_set}; "
+                "evaluate both arms again"
+            )
