@@ -1,8 +1,8 @@
 """Navigation metrics as ratios of sums over episodes.
 
-Every metric is ``scale * sum(numerator) / sum(denominator)``: a mean over the episodes (success rate, SPL), over the
-successes (time to goal) or over the metres walked (collisions). That makes one resample of the sums a resample of
-every metric.
+Every metric is ``scale * sum(numerator) / sum(denominator)``: a mean over the episodes (success rate, SPL),
+over the successes (time to goal) or over the metres walked (collisions). That makes one resample of the sums
+a resample of every metric.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ METRICS: dict[str, Metric] = {
     "timeouts": Metric("timeouts", scale=100.0),
     "collisions": Metric("collisions", "path", scale=100.0),
 }
-"""Success rates, falls and timeouts in percent; mean time to goal over successes (t2g) and restricted mean time with
-failures at 120 s (rmt) in s; SPL (Anderson et al. 2018) and SoftSPL (Datta et al. 2020) in 0..1; collisions per 100 m."""
+"""Success rates, falls and timeouts in percent; mean time to goal over successes (t2g) and restricted mean
+time with failures at 120 s (rmt) in s; SPL (Anderson et al. 2018) and SoftSPL (Datta et al. 2020) in 0..1;
+collisions per 100 m."""
 
 
 def quantities(columns: Mapping[str, NDArray]) -> dict[str, NDArray]:

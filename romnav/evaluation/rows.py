@@ -5,12 +5,9 @@ Rows are all that evaluation hands on: metrics, tables and figures are pure func
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
+from romnav import files
 from romnav.config import Config
 from romnav.errors import RomnavError
 
@@ -29,7 +27,7 @@ SUCCESS_RADIUS = 0.5
 OUTCOMES = ("success", "fall", "timeout")
 TILE_CLASSES = ("outdoor", "room", "building")
 
-_POSES = [pa.field(f"{end}_{axis}", pa.float64()) for end in ("spawn", "goal") for axis in ("x", "y", "z", "yaw")]
+_POSES = [f"{end}_{axis}" for end in ("spawn", "goal") for axis in ("x", "y", "z", "yaw")]
 SCHEMA = pa.schema(
     [
         pa.field("arm", pa.string()),
@@ -38,14 +36,14 @@ SCHEMA = pa.schema(
         pa.field("tile", pa.int64()),
         pa.field("tile_class", pa.string()),
         pa.field("multi_story", pa.bool_()),
-        *_POSES,  # m, m, m, rad
+        *(pa.field(name, pa.float64()) for name in _POSES),  # m, m, m, rad
         pa.field("geodesic", pa.float64()),  # planar length of the shortest path from spawn to goal, m
         pa.field("level", pa.string()),  # "same" or "cross": does the goal lie on another level
         pa.field("success_time", pa.float64()),  # first time within SUCCESS_RADIUS in 3D, s; NaN if never
         pa.field("outcome", pa.string()),
         pa.field("time", pa.float64()),  # at which the episode ended, s
         pa.field("path_length", pa.float64()),  # planar, sampled at 5 Hz until the end, m
-        pa.field("final_distance", pa.float64()),  # geodesic distance to the goal at the end, m; may be infinite
+        pa.field("final_distance", pa.float64()),  # geodesic, at the end, m; may be infinite
         pa.field("collisions", pa.int64()),  # steps with contact
     ]
 )
@@ -129,7 +127,7 @@ def make(columns: Mapping[str, ArrayLike], provenance: Provenance, source: str =
         array = np.asarray(columns[field.name])
         kind = {"string": "OUT", "bool": "b", "int64": "iu", "double": "fiu"}[str(field.type)]
         if array.ndim != 1 or array.dtype.kind not in kind:
-            raise RomnavError(f"{source}: column {field.name} must be a list of {field.type}, not {array.dtype}")
+            raise RomnavError(f"{source}: column {field.name} must hold {field.type}, not {array.dtype}")
         arrays[field.name] = array.astype(object if kind == "OUT" else field.type.to_pandas_dtype())
     if len({len(array) for array in arrays.values()}) != 1 or not len(arrays["episode"]):
         raise RomnavError(f"{source}: columns are empty or of different lengths; evaluate the arm again")
@@ -147,26 +145,24 @@ def _check(c: Mapping[str, NDArray], source: str) -> None:
     if not np.array_equal(episodes, np.arange(n)):
         missing = np.setdiff1d(np.arange(episodes[-1] + 1), episodes)
         raise RomnavError(f"{source}: episode(s) {_some(missing)} missing; evaluate the arm again")
-    success = np.isfinite(c["success_time"])
-    finite = [name for name in SCHEMA.names if c[name].dtype.kind == "f" and name not in ("success_time", "final_distance")]
-    holds: dict[str, Any] = {
+    time, success = c["success_time"], np.isfinite(c["success_time"])
+    holds: dict[str, NDArray] = {
         "arm": c["arm"] == c["arm"][0],
         "seed": c["seed"] == c["seed"][0],
         "tile_class": np.isin(c["tile_class"], TILE_CLASSES),
         "level": np.isin(c["level"], ("same", "cross")),
+        "success_time": np.isnan(time) | ((time >= 0) & (time <= HORIZONS[-1])),
         "outcome": np.isin(c["outcome"], OUTCOMES) & ((c["outcome"] == "success") == success),
-        "success_time": np.isnan(c["success_time"]) | ((c["success_time"] >= 0) & (c["success_time"] <= HORIZONS[-1])),
         "final_distance": c["final_distance"] >= 0,
         "collisions": c["collisions"] >= 0,
-        **{name: np.isfinite(c[name]) for name in finite},
+        **{name: np.isfinite(c[name]) & (c[name] >= 0) for name in ("geodesic", "time", "path_length")},
+        **{name: np.isfinite(c[name]) for name in _POSES},
     }
-    for name in ("geodesic", "time", "path_length"):
-        holds[name] = holds[name] & (c[name] >= 0)
     for name, ok in holds.items():
         if not np.all(ok):
             worst = int(np.argmin(ok))
             raise RomnavError(
-                f"{source}: episode {episodes[worst]} has the impossible {name} {c[name][worst]!r}; evaluate the arm again"
+                f"{source}: episode {worst} has an impossible {name} ({c[name][worst]}); evaluate again"
             )
 
 
@@ -183,19 +179,8 @@ def write(path: Path, rows: EpisodeRows) -> None:
     """
     metadata = {"romnav.rows": str(SCHEMA_VERSION), "romnav.provenance": rows.provenance.model_dump_json()}
     table = pa.table(dict(rows.columns), schema=SCHEMA.with_metadata(metadata))
-    part = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(handle, "wb") as file:
-            pq.write_table(table, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        if part is not None:
-            Path(part).unlink(missing_ok=True)
-        raise RomnavError(f"{path}: cannot be written ({error.strerror or error}); free the disk or its permissions") from error
+    with files.atomic(path) as file:
+        pq.write_table(table, file)
 
 
 def read(path: Path) -> EpisodeRows:
@@ -237,7 +222,7 @@ def pair(runs: Iterable[EpisodeRows]) -> list[Arm]:
         seeds = groups.setdefault(run.arm, {})
         if run.seed in seeds:
             raise RomnavError(
-                f"{seeds[run.seed].source} and {run.source}: both hold arm {run.arm}, seed {run.seed}; remove one"
+                f"{seeds[run.seed].source} and {run.source}: both hold {run.arm}, seed {run.seed}; remove one"
             )
         seeds[run.seed] = run
     return [Arm(name, tuple(seeds[seed] for seed in sorted(seeds))) for name, seeds in groups.items()]
@@ -247,12 +232,13 @@ def _same_episodes(a: EpisodeRows, b: EpisodeRows) -> None:
     both = f"{a.source} and {b.source}"
     if a.provenance.episode_set != b.provenance.episode_set:
         raise RomnavError(
-            f"{both}: rows of different episode sets ({a.provenance.episode_set} and {b.provenance.episode_set}); "
-            "evaluate both arms on the same set"
+            f"{both}: rows of different episode sets, {a.provenance.episode_set} and "
+            f"{b.provenance.episode_set}; evaluate both on the same set"
         )
     if len(a) != len(b):
         raise RomnavError(
-            f"{both}: {len(a)} and {len(b)} episodes of set {a.provenance.episode_set}; evaluate the shorter one again"
+            f"{both}: {len(a)} and {len(b)} episodes of set {a.provenance.episode_set}; "
+            "evaluate the shorter one again"
         )
     for name in ("tile", "level"):
         if not np.array_equal(a.columns[name], b.columns[name]):

@@ -1,0 +1,209 @@
+"""Paired statistics of arms evaluated on the same episodes.
+
+One resample of the episodes is shared by every arm, metric and contrast, so that what makes an episode hard
+cancels in a difference. The resample is a matrix of counts, and the resampled sums of all quantities are its
+product with the episodes' values: one matrix multiplication for every interval.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from romnav.errors import RomnavError
+from romnav.evaluation.metrics import LEVELS, METRICS, Level, Metric, in_level, quantities
+from romnav.evaluation.rows import HORIZONS, Arm
+
+Cluster = Literal["episode", "tile"]
+_DISJOINT: tuple[Level, ...] = ("same", "cross")
+_CHUNK = 128  # resamples at a time: their counts stay in the cache
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A metric with its percentile bootstrap interval, over n episodes."""
+
+    value: float
+    lo: float
+    hi: float
+    n: int
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Success rate of arm a minus that of arm b on the same episodes, in percent.
+
+    Attributes:
+        a_only: Episodes that only a solved; None where an arm has several training seeds.
+        b_only: Episodes that only b solved; None likewise.
+        mid_p: McNemar mid-p value of the two; None likewise.
+    """
+
+    a: str
+    b: str
+    horizon: int
+    level: Level
+    diff: float
+    lo: float
+    hi: float
+    n: int
+    a_only: int | None
+    b_only: int | None
+    mid_p: float | None
+
+    @property
+    def significant(self) -> bool:
+        """Whether zero lies outside the interval (the dagger of the paper's tables)."""
+        return self.lo > 0 or self.hi < 0
+
+
+class Bootstrap:
+    """Percentile bootstrap of arms over one shared resample of their episodes.
+
+    Where an arm has several training seeds, its seeds are resampled too, independently of the episodes and of
+    the other arms' seeds (crossed two-level bootstrap, Owen 2007). Draws depend only on ``seed`` and the arm.
+
+    Args:
+        arms: Arms on the same episodes, as ``rows.pair`` returns them.
+        resamples: Number of resamples.
+        seed: Seed of the resampling.
+        cluster: Unit that is resampled. By episode compares with the paper; by tile allows for episodes of
+            one tile being alike.
+        confidence: Coverage of the intervals.
+    """
+
+    def __init__(
+        self,
+        arms: Sequence[Arm],
+        *,
+        resamples: int = 10_000,
+        seed: int = 0,
+        cluster: Cluster = "episode",
+        confidence: float = 0.95,
+    ) -> None:
+        if not arms:
+            raise RomnavError("no arms to compare; evaluate at least one")
+        self.arms = {arm.name: arm for arm in arms}
+        self._tails = (50 * (1 - confidence), 50 * (1 + confidence))
+        columns = arms[0].runs[0].columns
+        self._masks: dict[Level, NDArray] = {level: in_level(columns, level) for level in LEVELS}
+        index: dict[tuple[str, int, Level, str], int] = {}
+        values: list[NDArray] = []
+        for arm in arms:
+            for k, run in enumerate(arm.runs):
+                for name, value in quantities(run.columns).items():
+                    for level in _DISJOINT:
+                        index[arm.name, k, level, name] = len(values)
+                        values.append(value * self._masks[level])
+        table = np.stack(values, axis=1)
+        units, inverse = np.unique(columns[cluster], return_inverse=True)
+        per_unit = np.zeros((len(units), table.shape[1]))
+        np.add.at(per_unit, inverse, table)
+        self._index = index
+        self._point = per_unit.sum(axis=0)
+        self._sums = resampled_sums(per_unit, resamples, seed)
+        self._seed_weights = {arm.name: _seed_weights(arm, resamples, seed) for arm in arms}
+
+    def metric(self, arm: str, metric: str, level: Level = "all") -> Estimate:
+        """A metric of ``METRICS`` for one arm, pooled over its training seeds."""
+        value, draws = self._ratio(arm, METRICS[metric], level)
+        return Estimate(value, *self._interval(draws), n=int(self._masks[level].sum()))
+
+    def contrast(self, a: str, b: str, horizon: int = HORIZONS[-1], level: Level = "all") -> Contrast:
+        """Difference of two arms' success rates within a horizon."""
+        rate = METRICS[f"sr_{horizon}"]
+        (value_a, draws_a), (value_b, draws_b) = self._ratio(a, rate, level), self._ratio(b, rate, level)
+        interval, mask = self._interval(draws_a - draws_b), self._masks[level]
+        a_only = b_only = mid_p = None
+        if len(self.arms[a].runs) == len(self.arms[b].runs) == 1:
+            solved_a, solved_b = (
+                self.arms[arm].runs[0].columns["success_time"][mask] <= horizon for arm in (a, b)
+            )
+            a_only, b_only = int((solved_a & ~solved_b).sum()), int((solved_b & ~solved_a).sum())
+            mid_p = mcnemar_mid_p(a_only, b_only)
+        return Contrast(
+            a, b, horizon, level, value_a - value_b, *interval, int(mask.sum()), a_only, b_only, mid_p
+        )
+
+    def _ratio(self, arm: str, metric: Metric, level: Level) -> tuple[float, NDArray]:
+        """The metric's value, and its value in every resample, shape (resamples,)."""
+        levels = _DISJOINT if level == "all" else (level,)
+        weights = self._seed_weights[arm]
+        point, draws = [], []
+        for name in (metric.numerator, metric.denominator):
+            where = [[self._index[arm, k, part, name] for part in levels] for k in range(weights.shape[1])]
+            point.append(self._point[where].sum())
+            draws.append((self._sums[:, where].sum(axis=2) * weights).sum(axis=1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            value, samples = (metric.scale * num / den for num, den in (point, draws))
+        return float(value), samples
+
+    def _interval(self, draws: NDArray) -> tuple[float, float]:
+        """Percentile interval of the resamples in which the statistic exists."""
+        draws = draws[np.isfinite(draws)]
+        if not len(draws):
+            return math.nan, math.nan
+        lo, hi = np.percentile(draws, self._tails)
+        return float(lo), float(hi)
+
+
+def resampled_sums(values: NDArray, resamples: int, seed: int = 0) -> NDArray:
+    """Column sums of rows drawn with replacement, every column over the same draws.
+
+    Args:
+        values: Values per resampled unit, shape (n, columns).
+        resamples: Number of resamples of n rows each.
+        seed: Seed; block k of the resamples has the stream (seed, k), so more resamples extend fewer.
+
+    Returns:
+        Sums, shape (resamples, columns).
+    """
+    return np.concatenate([counts @ values for counts in _counts(len(values), resamples, seed)])
+
+
+def _counts(n: int, resamples: int, seed: int) -> Iterator[NDArray]:
+    """How often each resample drew each unit, in blocks of shape (<= _CHUNK, n)."""
+    offsets = n * np.arange(_CHUNK)[:, None]
+    for block, start in enumerate(range(0, resamples, _CHUNK)):
+        stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(block,))))
+        drawn = stream.integers(0, n, (_CHUNK, n), dtype=np.uint16 if n <= 2**16 else np.uint32)
+        counts = np.bincount((drawn + offsets).ravel(), minlength=_CHUNK * n).reshape(_CHUNK, n)
+        yield counts[: resamples - start].astype(float)
+
+
+def _seed_weights(arm: Arm, resamples: int, seed: int) -> NDArray:
+    """How often each resample drew each training seed of an arm, shape (resamples, seeds)."""
+    name = int.from_bytes(hashlib.sha256(arm.name.encode()).digest()[:4])
+    stream = np.random.default_rng([seed, name])
+    seeds = len(arm.runs)
+    return stream.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples)
+
+
+def mcnemar_mid_p(a_only: int, b_only: int) -> float:
+    """Two-sided exact McNemar test with the mid-p correction (Fagerland et al. 2013).
+
+    Args:
+        a_only: Pairs in which only a succeeded.
+        b_only: Pairs in which only b succeeded.
+    """
+    n, k = a_only + b_only, min(a_only, b_only)
+    twice_tail = 2 * sum(math.comb(n, i) for i in range(k)) + math.comb(n, k)
+    return twice_tail / 2**n
+
+
+def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson score interval of a proportion (Wilson 1927), in 0..1; NaN where n is zero."""
+    if n == 0:
+        return math.nan, math.nan
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    p, shrink = successes / n, 1 + z * z / n
+    centre = (p + z * z / (2 * n)) / shrink
+    half = z / shrink * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, centre - half), min(1.0, centre + half)

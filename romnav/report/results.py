@@ -1,0 +1,94 @@
+"""Every evaluated arm and contrast of a scale, as plain data for scripts."""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+from romnav.errors import RomnavError
+from romnav.evaluation import metrics, rows
+from romnav.evaluation.statistics import Bootstrap
+
+ROWS_FILE = "episodes.parquet"
+
+
+def load(results_dir: Path, scale: str) -> list[rows.Arm]:
+    """Reads the rows of every arm of a scale, from ``<results_dir>/<scale>/<arm>/seed-<n>/episodes.parquet``.
+
+    Raises:
+        RomnavError: There are none, one is unreadable, or they cannot be compared.
+    """
+    folder = results_dir / scale
+    files = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
+    if not files:
+        raise RomnavError(
+            f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`"
+        )
+    return rows.pair(_read_in_place(file, scale) for file in files)
+
+
+def _read_in_place(file: Path, scale: str) -> rows.EpisodeRows:
+    run = rows.read(file)
+    holds = (run.provenance.scale, run.arm, f"seed-{run.seed}")
+    if holds != (scale, *file.parts[-3:-1]):
+        raise RomnavError(f"{file}: holds the rows of {'/'.join(holds)}; move it there or evaluate again")
+    return run
+
+
+def collect(results_dir: Path, scale: str) -> dict[str, Any]:
+    """What ``romnav results --json`` prints: metrics per arm and training seed, contrasts per ordered pair.
+
+    Rates and differences are in percent, times in s, training in environment steps and hours; a value that
+    does not exist (time to goal without a success) is None. Contrasts pool the training seeds of an arm.
+    """
+    arms = load(results_dir, scale)
+    bootstrap = Bootstrap(arms)
+    return {
+        "scale": scale,
+        "episode_set": arms[0].runs[0].provenance.episode_set,
+        "arms": [_arm(run) for arm in arms for run in arm.runs],
+        "contrasts": [
+            _contrast(bootstrap, a.name, b.name, horizon, level)
+            for a, b in permutations(arms, 2)
+            for horizon in rows.HORIZONS
+            for level in metrics.LEVELS
+        ],
+    }
+
+
+def _arm(run: rows.EpisodeRows) -> dict[str, Any]:
+    total, same, cross = (metrics.evaluate(run.columns, level) for level in metrics.LEVELS)
+    values = {
+        "sr_45": total["sr_45"],
+        "sr_120": total["sr_120"],
+        "sr_45_same": same["sr_45"],
+        "sr_45_cross": cross["sr_45"],
+        "sr_120_same": same["sr_120"],
+        "sr_120_cross": cross["sr_120"],
+        **{name: total[name] for name in ("t2g", "spl", "falls", "timeouts")},
+    }
+    return {
+        "arm": run.arm,
+        "seed": run.seed,
+        "steps": run.provenance.steps,
+        "hours": run.provenance.hours,
+        **{name: _or_none(value) for name, value in values.items()},
+    }
+
+
+def _contrast(bootstrap: Bootstrap, a: str, b: str, horizon: int, level: metrics.Level) -> dict[str, Any]:
+    contrast = bootstrap.contrast(a, b, horizon, level)
+    return {
+        "a": a,
+        "b": b,
+        "horizon": horizon,
+        "level": level,
+        **{name: _or_none(getattr(contrast, name)) for name in ("diff", "lo", "hi")},
+        "n": contrast.n,
+    }
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None

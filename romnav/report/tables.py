@@ -1,0 +1,245 @@
+"""The paper's tables of paired episodes, made from episode rows, the paper's rows beside ours."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from romnav.errors import RomnavError
+from romnav.evaluation.metrics import Level
+from romnav.evaluation.rows import HORIZONS, Arm
+from romnav.evaluation.statistics import Bootstrap
+from romnav.report import paper
+from romnav.report.formats import Block, Cell, Row, Table, number
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An arm in a table: its name in ``results/``, its label, and whether it competes for bold."""
+
+    arm: str
+    label: str
+    competes: bool = True
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric in a performance table; ``best`` picks the value in bold."""
+
+    metric: str
+    header: str
+    decimals: int
+    best: Callable[[list[float]], float] | None
+
+
+@dataclass(frozen=True)
+class PerformanceSpec:
+    """Metrics per arm. Blocks of arms are set apart; bounds are scripted arms, shown if evaluated."""
+
+    name: str
+    caption: str
+    reference: Entry
+    blocks: tuple[tuple[Entry, ...], ...]
+    columns: tuple[Column, ...]
+    bounds: tuple[Entry, ...] = ()
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Every arm of the table."""
+        return (*(entry for block in self.blocks for entry in block), *self.bounds)
+
+
+@dataclass(frozen=True)
+class LevelsSpec:
+    """Success rate of a reference arm minus that of each other arm, by horizon and level."""
+
+    name: str
+    caption: str
+    reference: Entry
+    others: tuple[Entry, ...]
+    bounds: tuple[Entry, ...] = ()
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Every arm of the table."""
+        return (self.reference, *self.others, *self.bounds)
+
+
+_ROM = Entry("rom", "RoM")
+_ABLATIONS = (Entry("uniform", "Uniform"), Entry("nocap", "NoCap"), Entry("uniform-nocap", "UniformNoCap"))
+_ROM_CYL = Entry("rom", "RoM (cyl)*", competes=False)
+_SINGLE, _ROM_HUM = Entry("single-stage", "Single-Stage"), Entry("rom-hum", "RoM (hum)")
+_ROM_NAV = Entry("rom-nav", "RoM-Nav")
+_BOUNDS = (Entry("oracle", "Oracle", competes=False), Entry("straight", "Straight", competes=False))
+_RATES = (Column("sr_45", "SR@45 (%)", 1, max), Column("sr_120", "SR@120 (%)", 1, max))
+_TIME, _SPL = Column("t2g", "T2G (s)", 1, min), Column("spl", "SPL", 3, max)
+_METRICS = (
+    "SR@45 and SR@120 are success within 45 s (the training budget) and 120 s; T2G is the mean time to goal "
+    "over successful episodes; SPL is success weighted by path length against the geodesic route."
+)
+_DAGGER = "† marks a 95% confidence interval excluding zero."
+
+SPECS: tuple[PerformanceSpec | LevelsSpec, ...] = (
+    PerformanceSpec(
+        "spawngoal-perf-rom",
+        f"Spawn/goal-distribution ablation on the RoM. {_METRICS} Bold marks the best arm per column (not of "
+        "T2G, which favours arms that complete only short episodes). Oracle follows the true geodesic, "
+        "Straight walks towards the goal: scripted bounds.",
+        _ROM,
+        ((_ROM, *_ABLATIONS),),
+        (*_RATES, dataclasses.replace(_TIME, best=None), _SPL),
+        _BOUNDS,
+    ),
+    LevelsSpec(
+        "spawngoal-levels-rom",
+        "Spawn/goal ablation: paired contrasts of success rate by same-level and cross-level goals. "
+        f"Positive favours RoM; {_DAGGER}",
+        _ROM,
+        _ABLATIONS,
+        _BOUNDS,
+    ),
+    PerformanceSpec(
+        "nav-perf",
+        f"Navigation performance across training methods. {_METRICS} Bold marks the best humanoid arm per "
+        "column. *RoM (cyl) is evaluated on RoM dynamics.",
+        _ROM_NAV,
+        ((_ROM_CYL,), (_SINGLE, _ROM_HUM, _ROM_NAV)),
+        (*_RATES, _TIME, _SPL),
+    ),
+    LevelsSpec(
+        "nav-levels",
+        "Paired contrasts of success rate by same-level and cross-level goals. "
+        f"Positive favours RoM-Nav; {_DAGGER}",
+        _ROM_NAV,
+        (_ROM_HUM, _SINGLE),
+    ),
+)
+"""The tables of the paper's Sec. IV that are made of paired episodes."""
+
+_BY_LEVEL: tuple[tuple[int, Level], ...] = tuple((h, level) for h in HORIZONS for level in ("same", "cross"))
+_Blocks = list[tuple[Row, ...]]
+
+
+def build_all(arms: Sequence[Arm]) -> list[Table]:
+    """Every table of ``SPECS`` whose reference arm and at least one other arm were evaluated.
+
+    Raises:
+        RomnavError: No table can be made of these arms.
+    """
+    bootstrap = Bootstrap(arms)
+    possible = [
+        spec
+        for spec in SPECS
+        if spec.reference.arm in bootstrap.arms
+        and len({e.arm for e in spec.entries} & set(bootstrap.arms)) > 1
+    ]
+    if not possible:
+        needed = " or ".join(sorted({spec.reference.arm for spec in SPECS}))
+        raise RomnavError(
+            f"{', '.join(bootstrap.arms)}: no table can be made of these; evaluate {needed} and another arm"
+        )
+    return [build(spec, bootstrap) for spec in possible]
+
+
+def build(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> Table:
+    """Makes a table of the arms of a bootstrap; trained arms that were not evaluated are shown as dashes."""
+    if isinstance(spec, PerformanceSpec):
+        spans: tuple[tuple[str, int], ...] = ()
+        header = ("Arm", *(column.header for column in spec.columns))
+        keys = tuple(column.metric for column in spec.columns)
+        ours, published = _performance(spec, bootstrap)
+    else:
+        spans = tuple((f"{horizon} s", 2) for horizon in HORIZONS)
+        header = ("Contrast (%)", *(level for _, level in _BY_LEVEL))
+        keys = tuple(f"sr_{horizon}_{level}" for horizon, level in _BY_LEVEL)
+        ours, published = _levels(spec, bootstrap)
+    provenance, note = _provenance(spec, bootstrap)
+    groups = (("ours", f"This work, {provenance['scale']} scale", ours), ("paper", "Paper", published))
+    blocks = tuple(
+        Block(source, title if k == 0 else "", rows)
+        for source, title, parts in groups
+        for k, rows in enumerate(filter(None, parts))
+    )
+    return Table(spec.name, f"{spec.caption} {note}", spans, header, keys, blocks, provenance)
+
+
+def _performance(spec: PerformanceSpec, bootstrap: Bootstrap) -> tuple[_Blocks, _Blocks]:
+    def measured(arm: str, column: Column) -> Cell:
+        if arm not in bootstrap.arms:
+            return number(math.nan, column.decimals)
+        estimate = bootstrap.metric(arm, column.metric)
+        return number(estimate.value, column.decimals, lo=estimate.lo, hi=estimate.hi, n=estimate.n)
+
+    def published(arm: str, column: Column) -> Cell:
+        return number(paper.PERFORMANCE[arm][column.metric], column.decimals)
+
+    bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
+    return _with_best(spec, (*spec.blocks, bounds), measured), _with_best(spec, spec.blocks, published)
+
+
+def _with_best(
+    spec: PerformanceSpec, blocks: Sequence[tuple[Entry, ...]], cell: Callable[[str, Column], Cell]
+) -> _Blocks:
+    """Rows of every block; bold marks a column's best shown value (and ties) among competing arms."""
+    competing = [entry.arm for block in blocks for entry in block if entry.competes]
+
+    def column_cells(column: Column) -> dict[str, Cell]:
+        cells = {entry.arm: cell(entry.arm, column) for block in blocks for entry in block}
+        shown = {arm: float(cells[arm].text) for arm in competing if math.isfinite(cells[arm].value)}
+        best = column.best(list(shown.values())) if column.best and shown else None
+        return {
+            arm: dataclasses.replace(c, bold=shown.get(arm, math.nan) == best) for arm, c in cells.items()
+        }
+
+    columns = [column_cells(column) for column in spec.columns]
+    return [tuple(Row(e.label, tuple(cells[e.arm] for cells in columns)) for e in block) for block in blocks]
+
+
+def _levels(spec: LevelsSpec, bootstrap: Bootstrap) -> tuple[_Blocks, _Blocks]:
+    def measured(arm: str, horizon: int, level: Level) -> Cell:
+        if not {spec.reference.arm, arm} <= set(bootstrap.arms):
+            return number(math.nan, 1)
+        c = bootstrap.contrast(spec.reference.arm, arm, horizon, level)
+        return number(c.diff, 1, sign=True, lo=c.lo, hi=c.hi, n=c.n, dagger=c.significant)
+
+    def published(arm: str, horizon: int, level: Level) -> Cell:
+        diff, significant = paper.CONTRASTS[spec.reference.arm, arm][horizon, level]
+        return number(diff, 1, sign=True, dagger=significant)
+
+    def rows(entries: Iterable[Entry], cell: Callable[[str, int, Level], Cell]) -> tuple[Row, ...]:
+        return tuple(
+            Row(
+                f"{spec.reference.label} − {entry.label}",
+                tuple(cell(entry.arm, *where) for where in _BY_LEVEL),
+            )
+            for entry in entries
+        )
+
+    bounds = [entry for entry in spec.bounds if entry.arm in bootstrap.arms]
+    return [rows(spec.others, measured), rows(bounds, measured)], [rows(spec.others, published)]
+
+
+def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tuple[dict[str, str], str]:
+    """Provenance of the evaluated arms of a table, and the end of its caption that states it."""
+    shown = [bootstrap.arms[e.arm] for e in spec.entries if e.arm in bootstrap.arms]
+    runs = [run for arm in shown for run in arm.runs]
+    trained = [arm for arm in shown if any(run.provenance.steps for run in arm.runs)]
+    facts = {
+        "scale": _range(run.provenance.scale for run in runs),
+        "commit": _range(run.provenance.commit[:12] for run in runs),
+        "episode_set": runs[0].provenance.episode_set,
+    }
+    steps = _range(f"{run.provenance.steps / 1e6:.3g} M" for arm in trained for run in arm.runs)
+    seeds = _range(str(len(arm.runs)) for arm in trained)
+    note = (
+        f"This work: {facts['scale']} scale, training of {steps} steps, training seeds per arm: {seeds}; "
+        f"{len(runs[0])} paired episodes of set {facts['episode_set'][:12]}; commit {facts['commit']}. "
+        "Paper: as published."
+    )
+    return facts, note
+
+
+def _range(texts: Iterable[str]) -> str:
+    return ", ".join(sorted(set(texts)))
