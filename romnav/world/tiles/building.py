@@ -1,0 +1,288 @@
+"""Multi-storey buildings: a corridor between two rows of rooms on every floor, joined by stairs and ramps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from romnav.world.solids import Label, SolidsBuilder
+from romnav.world.spec import WorldSpec
+from romnav.world.tile import Connector, Tile, TileClass
+from romnav.world.tiles.furniture import HALL, ROOM, furnish
+from romnav.world.tiles.site import Floor, Frame, Span, block, cut
+from romnav.world.tiles.stairs import SLAB, Railing, Staircase, draw_ramp, draw_stair
+
+WALL = 0.15
+APPROACH = 1.4
+"""Free depth before the mouth of a staircase, m."""
+
+
+@dataclass(frozen=True)
+class Core:
+    """A staircase in its hall: a stretch of one row of rooms, open to the corridor."""
+
+    stairs: Staircase
+    row: int
+    hall: Span
+    """Extent of the hall along the corridor, m."""
+    frame: Frame
+    first: int
+    last: int
+    """Storeys that it joins."""
+
+    def touches(self, storey: int) -> bool:
+        """Whether the hall is needed on ``storey``."""
+        return self.first <= storey <= self.last
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What all storeys of a building share. Local frame: origin at the building's corner, u along the corridor."""
+
+    frame: Frame
+    length: float
+    depth: float
+    corridor: Span
+    cores: tuple[Core, ...]
+    storeys: int
+
+    def row(self, row: int) -> Span:
+        """Extent across the corridor of the row of rooms below (0) or above (1) it."""
+        return (WALL, self.corridor[0]) if row == 0 else (self.corridor[1], self.depth - WALL)
+
+
+def building(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
+    """A building of two to ``spec.max_storeys`` storeys."""
+    plan = _draw_plan(rng, spec)
+    solids = SolidsBuilder()
+    railing = Railing.draw(rng)
+    connectors = []
+    for storey in range(plan.storeys):
+        connectors += _storey(solids, rng, spec, plan, storey, railing)
+    half = spec.storey_height / 2
+    return Tile(
+        kind=TileClass.BUILDING,
+        seed=seed,
+        side=spec.side,
+        solids=solids.build(),
+        layers=tuple(half * k for k in range(2 * plan.storeys - 1)),
+        storeys=tuple(range(0, 2 * plan.storeys - 1, 2)),
+        connectors=tuple(connectors),
+    )
+
+
+def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
+    storeys = int(rng.integers(min(2, spec.max_storeys), spec.max_storeys + 1))
+    room = spec.side - 0.6
+    while True:
+        yaw = float(rng.uniform(-0.35, 0.35)) if rng.random() < 0.4 else 0.0
+        length, depth = float(rng.uniform(0.72, 1.0)) * room, float(rng.uniform(0.6, 0.95)) * room
+        c, s = np.cos(yaw), abs(np.sin(yaw))
+        if max(length * c + depth * s, length * s + depth * c) <= room:
+            break
+    quarter = float(rng.integers(4)) * np.pi / 2
+    middle = Frame(spec.side / 2, spec.side / 2, yaw + quarter)
+    frame = middle.sub(-length / 2, -depth / 2)
+    width = float(rng.uniform(1.8, 2.6))
+    start = (depth - width) * float(rng.uniform(0.38, 0.62))
+    empty = Plan(frame, length, depth, (start, start + width), (), storeys)
+    rows = [int(r) for r in rng.permutation(2)][: 1 if rng.random() < 0.4 else 2]
+    relay = len(rows) == 2 and storeys == 3 and rng.random() < 0.35
+    cores = []
+    for k, row in enumerate(rows):
+        first, last = ((k, k + 1) if relay else (0, storeys - 1)) if k == 0 or relay else _span(rng, storeys)
+        core = _draw_core(rng, spec, empty, row, first, last)
+        if core is not None:
+            cores.append(core)
+    return Plan(frame, length, depth, empty.corridor, tuple(cores), storeys)
+
+
+def _span(rng: np.random.Generator, storeys: int) -> tuple[int, int]:
+    first = int(rng.integers(storeys - 1))
+    return first, int(rng.integers(first + 1, storeys))
+
+
+def _draw_core(
+    rng: np.random.Generator, spec: WorldSpec, plan: Plan, row: int, first: int, last: int
+) -> Core | None:
+    v0, v1 = plan.row(row)
+    depth, length = v1 - v0, plan.length - 2 * WALL
+    for _ in range(20):
+        kind = int(rng.choice(4, p=(0.3, 0.2, 0.25, 0.25)))
+        width, half = float(rng.uniform(1.4, 1.8)), spec.storey_height / 2
+        flight = (
+            draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width)
+        )
+        stairs = Staircase(flight, float(rng.uniform(1.4, 1.8)), turn=kind != 2)
+        wide, reach = 2 * stairs.half_width, stairs.length
+        along = reach + APPROACH * (1 if stairs.turn else 2)
+        if kind == 0:
+            span = wide + float(rng.uniform(0.0, 3.0))
+            fits = depth >= reach + 0.6
+        else:
+            span = along + float(rng.uniform(0.0, 1.5))
+            fits = depth >= wide
+        if not fits or span > length:
+            continue
+        left = float(rng.choice([0.0, 1.0, rng.uniform()])) * (length - span)
+        left = 0.0 if left < 2.6 else length - span if length - span - left < 2.6 else left
+        hall = (WALL + left, WALL + left + span)
+        if kind == 0:
+            at = hall[0] + float(rng.uniform(wide / 2, span - wide / 2))
+            mouth, yaw = (v1 - reach, np.pi / 2) if row else (v0 + reach, -np.pi / 2)
+            return Core(stairs, row, hall, plan.frame.sub(at, mouth, yaw), first, last)
+        side = v1 - wide / 2 if row else v0 + wide / 2
+        if rng.random() < 0.5 and depth > wide + 1.0:
+            side = float(rng.uniform(v0 + wide / 2, v1 - wide / 2))
+        if rng.random() < 0.5:
+            frame = plan.frame.sub(hall[0] + APPROACH, side)
+        else:
+            frame = plan.frame.sub(hall[1] - APPROACH, side, np.pi)
+        return Core(stairs, row, hall, frame, first, last)
+    return None
+
+
+def _storey(
+    solids: SolidsBuilder,
+    rng: np.random.Generator,
+    spec: WorldSpec,
+    plan: Plan,
+    storey: int,
+    railing: Railing,
+) -> list[Connector]:
+    z, frame, layer = storey * spec.storey_height, plan.frame, 2 * storey
+    top = z + spec.storey_height
+    ceiling = top - SLAB
+    holes = [_shaft(plan, core) for core in plan.cores if core.first < storey <= core.last]
+    for u, v in cut(((0.0, plan.length), (0.0, plan.depth)), holes):
+        block(solids, frame, u, v, (z - SLAB, z), label=Label.GROUND, layers=(layer, layer))
+    _outer_walls(solids, rng, plan, z, top)
+
+    floor = Floor(spec.side)
+    floor.open(frame, (WALL, plan.length - WALL), (WALL, plan.depth - WALL))
+    connectors = []
+    for core in plan.cores:
+        if not core.touches(storey):
+            continue
+        shaft = core.stairs.shaft
+        floor.reserve(core.frame, shaft[0], shaft[1], 0.1)
+        mouth = (-APPROACH, 0.0)
+        floor.reserve(core.frame, mouth, shaft[1])
+        if not core.stairs.turn:
+            floor.reserve(core.frame, (shaft[0][1], shaft[0][1] + APPROACH), shaft[1])
+        if storey > core.first:
+            core.stairs.guard(solids, core.frame, z, railing, departs=storey < core.last)
+        if storey < core.last:
+            connectors.append(core.stairs.build(solids, core.frame, z, layer, railing))
+    rooms: list[tuple[Span, Span]] = []
+    for row in (0, 1):
+        rooms += _rooms(solids, rng, plan, floor, row, storey, (z, ceiling))
+    for u, v in rooms:
+        area = (u[1] - u[0]) * (v[1] - v[0])
+        at = frame.sub(u[0], v[0])
+        furnish(solids, rng, floor, at, (u[1] - u[0], v[1] - v[0]), z, ROOM, int(rng.poisson(area / 5.0)))
+    for core in plan.cores:
+        if core.touches(storey):
+            v = plan.row(core.row)
+            size = (core.hall[1] - core.hall[0], v[1] - v[0])
+            count = int(rng.poisson(size[0] * size[1] / 12.0))
+            furnish(solids, rng, floor, frame.sub(core.hall[0], v[0]), size, z, HALL, count)
+    size = (plan.length - 2 * WALL, plan.corridor[1] - plan.corridor[0])
+    furnish(solids, rng, floor, frame.sub(WALL, plan.corridor[0]), size, z, HALL, int(rng.poisson(2.0)))
+    return connectors
+
+
+def _shaft(plan: Plan, core: Core) -> tuple[Span, Span]:
+    """The shaft of ``core`` as a rectangle of the plan (its frame is turned by quarters only)."""
+    (u0, u1), (v0, v1) = core.stairs.shaft
+    c, s = np.cos(plan.frame.yaw), np.sin(plan.frame.yaw)
+    corners = []
+    for u, v in ((u0, v0), (u1, v1)):
+        x, y = core.frame.at(u, v)
+        dx, dy = x - plan.frame.x, y - plan.frame.y
+        corners.append((c * dx + s * dy, c * dy - s * dx))
+    (a0, b0), (a1, b1) = corners
+    return (min(a0, a1), max(a0, a1)), (min(b0, b1), max(b0, b1))
+
+
+def _outer_walls(solids: SolidsBuilder, rng: np.random.Generator, plan: Plan, z: float, top: float) -> None:
+    """Four walls with a band of windows between sill and lintel."""
+    sill, head = z + 0.9, z + float(rng.uniform(2.1, 2.6))
+    sides = (
+        (plan.frame, plan.length),
+        (plan.frame.sub(plan.length, 0.0, np.pi / 2), plan.depth),
+        (plan.frame.sub(plan.length, plan.depth, np.pi), plan.length),
+        (plan.frame.sub(0.0, plan.depth, -np.pi / 2), plan.depth),
+    )
+    for side, length in sides:
+        run = (0.0, length - WALL)
+        block(solids, side, run, (0.0, WALL), (z - SLAB, sill))
+        block(solids, side, run, (0.0, WALL), (head, top - SLAB))
+        count = max(1, int(length / rng.uniform(3.0, 4.5)))
+        pitch = length / count
+        window = float(rng.uniform(1.0, 0.6 * pitch))
+        edges = [
+            0.0,
+            *(pitch * k + s * window / 2 for k in np.arange(count) + 0.5 for s in (-1, 1)),
+            length - WALL,
+        ]
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            block(solids, side, (float(a), float(b)), (0.0, WALL), (sill, head))
+
+
+def _rooms(
+    solids: SolidsBuilder,
+    rng: np.random.Generator,
+    plan: Plan,
+    floor: Floor,
+    row: int,
+    storey: int,
+    z: Span,
+) -> list[tuple[Span, Span]]:
+    """Divide a row into rooms around its halls, with walls and doors; their clear rectangles."""
+    v = plan.row(row)
+    halls = sorted(core.hall for core in plan.cores if core.row == row and core.touches(storey))
+    rooms, start = [], WALL
+    for hall in [*halls, (plan.length - WALL, plan.length)]:
+        stretch = hall[0] - start
+        if stretch > 2.0:
+            count = max(1, round(stretch / float(rng.uniform(3.4, 6.5))))
+            cuts = start + stretch * (np.arange(1, count) + rng.uniform(-0.15, 0.15, count - 1)) / count
+            edges = [start, *(float(c) for c in cuts), hall[0]]
+            for a, b in zip(edges[:-1], edges[1:], strict=True):
+                rooms.append(((a, b), v))
+            bounds = edges[1:-1] + [e for e in (start, hall[0]) if WALL < e < plan.length - WALL - 1e-9]
+            for u in bounds:
+                side = plan.frame.sub(u, v[0], np.pi / 2)
+                _wall(solids, rng, floor, side, v[1] - v[0], z, rng.random() < 0.35)
+        start = hall[1]
+    edge = plan.frame.sub(0.0, plan.corridor[0] if row == 0 else plan.corridor[1])
+    for u, _ in rooms:
+        if rng.random() < 0.88:
+            _wall(solids, rng, floor, edge.sub(u[0], 0.0), u[1] - u[0], z, True)
+    return rooms
+
+
+def _wall(
+    solids: SolidsBuilder,
+    rng: np.random.Generator,
+    floor: Floor,
+    frame: Frame,
+    length: float,
+    z: Span,
+    door: bool,
+) -> None:
+    """An interior wall along u, with a doorway if ``door``."""
+    half = WALL / 2
+    floor.reserve(frame, (0.0, length), (-half, half))
+    if not door:
+        block(solids, frame, (0.0, length), (-half, half), z)
+        return
+    width = min(float(rng.uniform(1.2, 1.7)), length - 0.6)
+    left = float(rng.uniform(0.3, length - width - 0.3))
+    head = z[0] + float(rng.uniform(2.05, 2.4))
+    block(solids, frame, (0.0, left), (-half, half), z)
+    block(solids, frame, (left + width, length), (-half, half), z)
+    block(solids, frame, (left, left + width), (-half, half), (head, z[1]))
+    floor.reserve(frame, (left - 0.1, left + width + 0.1), (-1.1, 1.1))

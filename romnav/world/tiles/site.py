@@ -1,0 +1,104 @@
+"""Local frames and reservations: what the tile generators build with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from romnav.world.solids import Label, SolidsBuilder
+
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Horizontal frame ``(u, v)`` at ``(x, y)``, rotated by ``yaw`` (m, rad)."""
+
+    x: float
+    y: float
+    yaw: float = 0.0
+
+    def at(self, u: float, v: float) -> tuple[float, float]:
+        """Tile coordinates of a local point."""
+        c, s = float(np.cos(self.yaw)), float(np.sin(self.yaw))
+        return self.x + c * u - s * v, self.y + s * u + c * v
+
+    def sub(self, u: float, v: float, yaw: float = 0.0) -> Frame:
+        """Frame at a local point, turned by ``yaw`` against this one."""
+        return Frame(*self.at(u, v), self.yaw + yaw)
+
+    def path(self, points: list[tuple[float, float, float]]) -> NDArray[np.float64]:
+        """(K, 3) tile coordinates of local points ``(u, v, z)``."""
+        return np.array([(*self.at(u, v), z) for u, v, z in points])
+
+
+def block(
+    solids: SolidsBuilder,
+    frame: Frame,
+    u: Span,
+    v: Span,
+    z: Span,
+    *,
+    slope: float = 0.0,
+    slope_bottom: float = 0.0,
+    label: Label = Label.OBSTACLE,
+    layers: tuple[int, int] = (-1, -1),
+) -> None:
+    """Add the box over the local rectangle ``u x v``; ``z`` and the slopes as in `SolidsBuilder.box`."""
+    solids.box(
+        frame.at((u[0] + u[1]) / 2, (v[0] + v[1]) / 2),
+        (u[1] - u[0], v[1] - v[0]),
+        z,
+        yaw=frame.yaw,
+        slope=slope,
+        slope_bottom=slope_bottom,
+        label=label,
+        layers=layers,
+    )
+
+
+def cut(outer: tuple[Span, Span], holes: list[tuple[Span, Span]]) -> list[tuple[Span, Span]]:
+    """Rectangles that cover ``outer`` less ``holes`` exactly, without overlap."""
+    parts = [outer]
+    for hu, hv in holes:
+        rest = []
+        for (u0, u1), (v0, v1) in parts:
+            a0, a1, b0, b1 = max(u0, hu[0]), min(u1, hu[1]), max(v0, hv[0]), min(v1, hv[1])
+            if a0 >= a1 or b0 >= b1:
+                rest.append(((u0, u1), (v0, v1)))
+                continue
+            strips = [((u0, a0), (v0, v1)), ((a1, u1), (v0, v1)), ((a0, a1), (v0, b0)), ((a0, a1), (b1, v1))]
+            rest += [(su, sv) for su, sv in strips if su[1] - su[0] > 1e-9 and sv[1] - sv[0] > 1e-9]
+        parts = rest
+    return parts
+
+
+class Floor:
+    """Reservations on one storey, on a 0.1 m raster: keeps furniture out of doorways, stairs and other furniture."""
+
+    def __init__(self, side: float, cell: float = 0.1) -> None:
+        centres = (np.arange(round(side / cell)) + 0.5) * cell
+        self._x, self._y = np.meshgrid(centres, centres, indexing="ij")
+        self._taken = np.ones(self._x.shape, bool)
+
+    def open(self, frame: Frame, u: Span, v: Span) -> None:
+        """Declare a local rectangle free."""
+        self._taken[self._inside(frame, u, v)] = False
+
+    def reserve(self, frame: Frame, u: Span, v: Span, margin: float = 0.0) -> None:
+        """Take a local rectangle, grown by ``margin``."""
+        self._taken[self._inside(frame, (u[0] - margin, u[1] + margin), (v[0] - margin, v[1] + margin))] = (
+            True
+        )
+
+    def fits(self, frame: Frame, u: Span, v: Span) -> bool:
+        """Whether nothing is taken inside a local rectangle."""
+        return not self._taken[self._inside(frame, u, v)].any()
+
+    def _inside(self, frame: Frame, u: Span, v: Span) -> NDArray[np.bool_]:
+        c, s = np.cos(frame.yaw), np.sin(frame.yaw)
+        dx, dy = self._x - frame.x, self._y - frame.y
+        lu, lv = c * dx + s * dy, c * dy - s * dx
+        return (lu >= u[0]) & (lu <= u[1]) & (lv >= v[0]) & (lv <= v[1])
