@@ -1,0 +1,96 @@
+"""Configuration of the sensors."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from romnav.config import Config
+
+
+class LidarSpec(Config):
+    """Range image of a Livox Mid-360 in the head of a G1, binned after levelling (paper, Sec. III-A)."""
+
+    rows: int = Field(default=59, ge=1)
+    """Pixels in elevation; 59 are 1 degree each (P)."""
+    columns: int = Field(default=220, ge=1)
+    """Pixels in azimuth; 220 are 1 degree each (P)."""
+    azimuth: float = Field(default=220.0, gt=0.0, le=360.0)
+    """Horizontal field, centred on the forward direction, degrees (P)."""
+    elevation: tuple[float, float] = (-55.0, 4.0)
+    """Lower and upper edge of the image above the horizon, degrees (A: the mounted sensor's field ahead)."""
+    height: float = 1.265
+    """Sensor above the terrain under a standing robot, m (A: G1 URDF, torso to mid360_link)."""
+    mount_pitch: float = 0.0511
+    """Pitch of the sensor, which is mounted upside down, in the torso, rad (A: G1 URDF)."""
+    field: tuple[float, float] = (-7.0, 52.0)
+    """Vertical field in the sensor's own frame, degrees (A: Mid-360 data sheet)."""
+    min_range: float = Field(default=0.1, ge=0.0)
+    """Nearest return, m (A: Mid-360 data sheet)."""
+    max_range: float = Field(default=30.0, gt=0.0)
+    """Farthest return, m (A: beyond the 28 m diagonal of a tile)."""
+    backend: Literal["columns", "mesh"] = "columns"
+    """"columns" intersects the solids in closed form; "mesh" casts rays at their triangles, as an oracle."""
+
+
+class CorruptionSpec(Config):
+    """What is done to clean range images (paper, "Pretraining Vision Encoders")."""
+
+    noise: tuple[float, float, float] = (0.02, 0.001, 0.0)
+    """Standard deviation of a range r as a polynomial ``n0 + n1 r + n2 r^2``, m (A: Mid-360 data sheet, 2 cm at 10 m)."""
+    dropout: tuple[float, float] = (0.0, 0.8)
+    """Least and largest share of lost pixels; each image draws its own (P)."""
+    occlusion: tuple[tuple[float, float, float, float], ...] = (
+        (0.0, 0.1, 0.75, 1.0),
+        (0.9, 1.0, 0.75, 1.0),
+        (0.05, 0.08, 0.0, 1.0),
+        (0.92, 0.95, 0.0, 1.0),
+    )
+    """Boxes hidden by the robot (left, right, top, bottom) as shares of the image (A: shoulders, posts of the head)."""
+    occlusion_jitter: float = Field(default=0.02, ge=0.0)
+    """Largest shift of every edge of those boxes between robots, share of the image (A)."""
+
+
+class EncoderSpec(Config):
+    """Variational autoencoder of one range sensor."""
+
+    cartesian: bool = True
+    """Whether x, y, z are channels and a head beside the range: for the LiDAR, not for the depth camera (P)."""
+    scale: float = Field(default=5.0, gt=0.0)
+    """Length that becomes 1 in the channels and heads, m (A)."""
+    widths: tuple[int, ...] = (16, 32, 64, 64)
+    """Channels after each stage of convolutions (A)."""
+    strides: tuple[tuple[int, int], ...] = ((2, 2), (2, 2), (2, 2), (1, 2))
+    """Rows and columns merged by each stage; 15 x 55 pixels become 2 x 4 tokens (A: few tokens keep attention cheap)."""
+    latent: int = 32
+    """Channels of a token (A)."""
+    bfloat16: bool = True
+    """Compute frozen tokens in bfloat16 (A: twice as fast where the CPU has it; error below the latent's own noise)."""
+
+
+class PretrainSpec(Config):
+    """Training of one encoder (paper, "Pretraining Vision Encoders")."""
+
+    encoder: EncoderSpec = EncoderSpec()
+    """Network."""
+    corruption: CorruptionSpec = CorruptionSpec()
+    """What is done to the inputs; targets stay clean."""
+    images: int = Field(default=2_000_000, ge=1)
+    """Images, half from uniform poses and half on or near stairs and ramps (P)."""
+    epochs: int = Field(default=10, ge=1)
+    """Passes over the images, each with new corruption (P)."""
+    batch: int = Field(default=256, ge=1)
+    """Images per gradient step (A)."""
+    learning_rate: float = 1e-3
+    """Peak of AdamW's learning rate, then a cosine to zero (A)."""
+    weight_decay: float = 1e-4
+    """Of AdamW (A)."""
+    sigma: float = Field(default=0.2, gt=0.0)
+    """Standard deviation of the likelihood behind the squared errors, m (A: it weighs geometry against the classes)."""
+    kl_weight: float = 1.0
+    """Weight of the Kullback-Leibler term (A: the evidence lower bound itself)."""
+    free_bits: float = 0.5
+    """Divergence that each latent dimension has for free, nat (A)."""
+    seed: int = 0
+    """Seed of weights, poses and corruption."""
