@@ -1,0 +1,169 @@
+"""Pictures of tiles: the paper's environment figure, a tile in 3D beside its occupancy grids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from romnav.world.grids import Grids
+from romnav.world.mesh import Mesh, triangulate
+from romnav.world.solids import Label, Shape, Solids
+from romnav.world.tile import Tile
+
+COLOURS = {
+    Label.GROUND: "#e4dfd3",
+    Label.OBSTACLE: "#7d8da3",
+    Label.STAIR: "#e69f00",
+    Label.RAMP: "#2a9d78",
+}
+WALL = "#aab4c0"
+OCCUPIED = "#49566a"
+PATH = "#b2182b"
+LIGHT = np.array([0.30, 0.45, 0.84])
+
+
+def draw_tile(
+    tile: Tile, grids: Grids, path: Path, *, azimuth: float = -60.0, elevation: float = 38.0
+) -> None:
+    """Draw ``tile`` in 3D beside the grid of every layer and save it to ``path`` (type by its suffix).
+
+    Walls and upper floors are translucent. Angles in degrees, of the viewer seen from the tile's centre.
+    """
+    layers = len(tile.layers)
+    columns = min(layers, 3)
+    rows = -(-layers // columns)
+    figure = Figure(figsize=(6.6 + 3.0 * columns, 6.2), layout="constrained")
+    spec = figure.add_gridspec(rows, columns + 1, width_ratios=[6.6 / 3.0, *[1.0] * columns])
+    axes = figure.add_subplot(spec[:, 0])
+    axes.imshow(render(tile, azimuth, elevation))
+    axes.set_axis_off()
+    axes.set_title(f"{tile.kind} {tile.seed}")
+    for layer in range(layers):
+        _draw_grid(figure.add_subplot(spec[layer // columns, 1 + layer % columns]), tile, grids, layer)
+    handles = [Patch(color=COLOURS[k], label=k.name.lower()) for k in (Label.GROUND, Label.STAIR, Label.RAMP)]
+    handles += [
+        Patch(color=OCCUPIED, label="occupied"),
+        Patch(color=PATH, label="stair and ramp centre lines"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def _draw_grid(axes: Axes, tile: Tile, grids: Grids, layer: int) -> None:
+    height, label, free = grids.height[layer], grids.label[layer], grids.free[layer]
+    image = np.ones((*height.shape, 3))
+    image[label >= 0] = to_rgb(OCCUPIED)
+    for kind in (Label.GROUND, Label.STAIR, Label.RAMP):
+        image[free & (label == kind)] = to_rgb(COLOURS[kind])
+    if len(tile.layers) == 1 and np.nanmax(height) > np.nanmin(height):
+        shade = 1.0 - 0.35 * (height - np.nanmin(height)) / (np.nanmax(height) - np.nanmin(height))
+        image[free] *= shade[free, None]
+    extent = (0.0, tile.side, 0.0, tile.side)
+    axes.imshow(image.transpose(1, 0, 2), origin="lower", extent=extent, interpolation="nearest")
+    for connector in tile.connectors:
+        if connector.layers[0] <= layer <= connector.layers[1]:
+            axes.plot(*connector.path[:, :2].T, color=PATH, linewidth=1.2)
+            axes.plot(*connector.path[-1, :2], marker="o", markersize=3, color=PATH)
+    name = f"floor {tile.storeys.index(layer)}" if layer in tile.storeys else "landings"
+    axes.set_title(f"{name}, z = {tile.layers[layer]:.1f} m", fontsize=9)
+    axes.set_xticks([0, 5, 10, 15, 20])
+    axes.set_yticks([0, 5, 10, 15, 20])
+    axes.tick_params(labelsize=7)
+
+
+def render(tile: Tile, azimuth: float, elevation: float, pixels: int = 1000) -> NDArray[np.float64]:
+    """(H, W, 3) orthographic image of ``tile`` with walls and upper floors translucent."""
+    solids = tile.solids
+    mesh = triangulate(solids, segments=20)
+    glass = _see_through(solids)
+    colour = np.array([to_rgb(COLOURS[Label(k)]) for k in solids.label])
+    colour[glass & (solids.label == Label.OBSTACLE)] = to_rgb(WALL)
+    points, normals = _view(mesh, np.radians(azimuth), np.radians(elevation))
+    span = np.ptp(points[..., :2], axis=(0, 1))
+    scale = (pixels - 20) / span.max()
+    low = points[..., :2].min(axis=(0, 1))
+    points = np.concatenate([(points[..., :2] - low) * scale + 10.0, points[..., 2:] * scale], axis=2)
+    width, high = (int(n) for n in np.ceil(span * scale + 20))
+    facing = normals @ _toward(np.radians(azimuth), np.radians(elevation)) > 1e-9
+    shade = 0.62 + 0.38 * np.clip(normals @ LIGHT, 0.0, 1.0)
+    paint = np.clip(colour[mesh.solid] * shade[:, None], 0.0, 1.0)
+
+    image = np.ones((high, width, 3))
+    depth = np.full((high, width), -np.inf)
+    owner = np.full((high, width), -1)
+    fragments = []
+    for t in np.flatnonzero(facing):
+        rows, cols, z = _fragments(points[t], width, high)
+        if glass[mesh.solid[t]]:
+            fragments.append((rows, cols, z, np.full(len(rows), t)))
+            continue
+        near = z > depth[rows, cols]
+        rows, cols = rows[near], cols[near]
+        depth[rows, cols], owner[rows, cols] = z[near], mesh.solid[t]
+        image[rows, cols] = paint[t]
+    edge = np.zeros((high, width), bool)
+    edge[:, 1:] |= owner[:, 1:] != owner[:, :-1]
+    edge[1:] |= owner[1:] != owner[:-1]
+    image[edge] *= 0.72
+    if fragments:
+        r, c, z, t = (np.concatenate(part) for part in zip(*fragments, strict=True))
+        front = z > depth[r, c]
+        r, c, z, t = r[front], c[front], z[front], t[front]
+        order = np.lexsort((z, r * width + c))
+        r, c, t = r[order], c[order], t[order]
+        pixel = r * width + c
+        first = np.flatnonzero(np.diff(pixel, prepend=-1))
+        rank = np.arange(len(pixel)) - np.repeat(first, np.diff(first, append=len(pixel)))
+        for k in range(int(rank.max(initial=-1)) + 1):
+            at = rank == k
+            image[r[at], c[at]] += 0.22 * (paint[t[at]] - image[r[at], c[at]])
+    return image[::-1]
+
+
+def _see_through(solids: Solids) -> NDArray[np.bool_]:
+    """(S,) walls and upper floors."""
+    thin = 2.0 * solids.half.min(axis=1)
+    wall = (solids.shape == Shape.BOX) & ~solids.walkable & (solids.top - solids.bottom > 0.85)
+    wall &= (thin > 0.12) & (thin < 0.32)
+    upper = (solids.layers[:, 0] > 0) & (solids.label == Label.GROUND) & (solids.layers[:, 0] % 2 == 0)
+    return wall | upper
+
+
+def _toward(azimuth: float, elevation: float) -> NDArray[np.float64]:
+    c = np.cos(elevation)
+    return np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
+
+
+def _view(mesh: Mesh, azimuth: float, elevation: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (T, 3, 3) as right, up and toward the viewer; outward unit normals (T, 3) in the tile frame."""
+    toward = _toward(azimuth, elevation)
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    basis = np.stack([right, np.cross(toward, right), toward], axis=1)
+    corners = mesh.corners
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    norm = np.linalg.norm(normal, axis=1, keepdims=True)
+    return corners @ basis, normal / np.maximum(norm, 1e-12)
+
+
+def _fragments(
+    corner: NDArray[np.float64], width: int, high: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Rows, columns and depths of the pixel centres inside a projected triangle."""
+    low = np.maximum(np.ceil(corner[:, :2].min(axis=0) - 0.5), 0).astype(int)
+    top = np.minimum(np.floor(corner[:, :2].max(axis=0) - 0.5), (width - 1, high - 1)).astype(int)
+    x, y = np.meshgrid(np.arange(low[0], top[0] + 1) + 0.5, np.arange(low[1], top[1] + 1) + 0.5)
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corner
+    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    if abs(area) < 1e-9 or x.size == 0:
+        return np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0)
+    wb = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area
+    wc = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
+    row, col = np.nonzero((wb >= 0.0) & (wc >= 0.0) & (wb + wc <= 1.0))
+    z = az + wb[row, col] * (bz - az) + wc[row, col] * (cz - az)
+    return row + low[1], col + low[0], z
