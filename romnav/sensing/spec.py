@@ -38,7 +38,7 @@ class CorruptionSpec(Config):
     """What is done to clean range images (paper, "Pretraining Vision Encoders")."""
 
     noise: tuple[float, float, float] = (0.02, 0.001, 0.0)
-    """Standard deviation of a range r as a polynomial ``n0 + n1 r + n2 r^2``, m (A: Mid-360 data sheet, 2 cm at 10 m)."""
+    """Standard deviation of a range r, ``n0 + n1 r + n2 r^2``, m (A: Mid-360 data sheet, 2 cm at 10 m)."""
     dropout: tuple[float, float] = (0.0, 0.8)
     """Least and largest share of lost pixels; each image draws its own (P)."""
     occlusion: tuple[tuple[float, float, float, float], ...] = (
@@ -47,7 +47,7 @@ class CorruptionSpec(Config):
         (0.05, 0.08, 0.0, 1.0),
         (0.92, 0.95, 0.0, 1.0),
     )
-    """Boxes hidden by the robot (left, right, top, bottom) as shares of the image (A: shoulders, posts of the head)."""
+    """Boxes (left, right, top, bottom) behind the robot, shares of the image (A: shoulders and posts)."""
     occlusion_jitter: float = Field(default=0.02, ge=0.0)
     """Largest shift of every edge of those boxes between robots, share of the image (A)."""
 
@@ -56,17 +56,17 @@ class EncoderSpec(Config):
     """Variational autoencoder of one range sensor."""
 
     cartesian: bool = True
-    """Whether x, y, z are channels and a head beside the range: for the LiDAR, not for the depth camera (P)."""
+    """Whether x, y, z are channels and a head beside the range: LiDAR yes, depth camera no (P)."""
     scale: float = Field(default=5.0, gt=0.0)
     """Length that becomes 1 in the channels and heads, m (A)."""
     widths: tuple[int, ...] = (16, 32, 64, 64)
     """Channels after each stage of convolutions (A)."""
     strides: tuple[tuple[int, int], ...] = ((2, 2), (2, 2), (2, 2), (1, 2))
-    """Rows and columns merged by each stage; 15 x 55 pixels become 2 x 4 tokens (A: few tokens keep attention cheap)."""
+    """Rows and columns merged by each stage; 15 x 55 pixels become 2 x 4 tokens (A: few are cheap)."""
     latent: int = 32
     """Channels of a token (A)."""
     bfloat16: bool = True
-    """Compute frozen tokens in bfloat16 (A: twice as fast where the CPU has it; error below the latent's own noise)."""
+    """Compute frozen tokens in bfloat16 (A: twice as fast; its error is far below the latent's own noise)."""
 
 
 class PretrainSpec(Config):
@@ -87,7 +87,7 @@ class PretrainSpec(Config):
     weight_decay: float = 1e-4
     """Of AdamW (A)."""
     sigma: float = Field(default=0.2, gt=0.0)
-    """Standard deviation of the likelihood behind the squared errors, m (A: it weighs geometry against the classes)."""
+    """Deviation of the likelihood behind the squared errors, m (A: weighs geometry against classes)."""
     kl_weight: float = 1.0
     """Weight of the Kullback-Leibler term (A: the evidence lower bound itself)."""
     free_bits: float = 0.5

@@ -1,0 +1,222 @@
+"""Variational autoencoder of range images; its latent map is the token sequence of the policy's attention."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from pydantic import ValidationError
+from torch import Tensor, nn
+
+from romnav import files
+from romnav.errors import RomnavError
+from romnav.sensing.spec import EncoderSpec
+from romnav.world.solids import Label
+
+FORMAT = "romnav-encoder-1"
+AGAIN = "run `romnav train encoder` again"
+
+
+class Encoder(nn.Module):
+    """Convolutions from range images to a Gaussian latent map (paper, "Pretraining Vision Encoders").
+
+    The first stage merges disjoint patches, the others are 3 x 3 convolutions with stride; images are padded
+    at the bottom and right to a multiple of the total stride.
+
+    Args:
+        spec: Network.
+        directions: (rows, columns, 3) direction of each pixel: its point is ``range * direction``.
+    """
+
+    directions: Tensor
+
+    def __init__(self, spec: EncoderSpec, directions: Tensor) -> None:
+        super().__init__()
+        self.spec = spec
+        self.register_buffer("directions", directions.float().cpu().clone(), persistent=False)
+        rows, columns = self.image_shape = (directions.shape[0], directions.shape[1])
+        row_stride, column_stride = (math.prod(s[i] for s in spec.strides) for i in (0, 1))
+        self.map_shape = (math.ceil(rows / row_stride), math.ceil(columns / column_stride))
+        self._padded = (self.map_shape[0] * row_stride, self.map_shape[1] * column_stride)
+        layers: list[nn.Module] = []
+        before = self.channels
+        for k, (width, stride) in enumerate(zip(spec.widths, spec.strides, strict=True)):
+            kernel, padding = (stride, 0) if k == 0 else (3, 1)
+            layers += [nn.Conv2d(before, width, kernel, stride, padding), nn.ReLU()]
+            before = width
+        self.trunk = nn.Sequential(*layers)
+        self.mean = nn.Conv2d(before, spec.latent, 1)
+        self.log_variance = nn.Conv2d(before, spec.latent, 1)
+
+    @property
+    def channels(self) -> int:
+        """Input channels: range, x, y, z, validity; or range and validity."""
+        return 5 if self.spec.cartesian else 2
+
+    @property
+    def token_shape(self) -> tuple[int, int]:
+        """(tokens, channels) of `tokens`."""
+        return math.prod(self.map_shape), self.spec.latent
+
+    def image(self, ranges: Tensor) -> Tensor:
+        """(B, channels, padded rows, padded columns) input for ``ranges`` (B, rows, columns) in m."""
+        rows, columns = self.image_shape
+        image = ranges.new_zeros(len(ranges), self.channels, *self._padded)
+        inner = image[:, :, :rows, :columns]
+        torch.mul(ranges, 1.0 / self.spec.scale, out=inner[:, 0])
+        if self.spec.cartesian:
+            torch.mul(inner[:, :1], self.directions.permute(2, 0, 1), out=inner[:, 1:4])
+        inner[:, -1] = ranges > 0
+        return image
+
+    def posterior(self, ranges: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log variance, each (B, latent, map rows, map columns)."""
+        features = self.trunk(self.image(ranges))
+        return self.mean(features), self.log_variance(features)
+
+    def forward(self, ranges: Tensor) -> Tensor:
+        """(B, tokens, channels) posterior means of ``ranges`` (B, rows, columns) in m, with gradients."""
+        return self.mean(self.trunk(self.image(ranges))).flatten(2).transpose(1, 2)
+
+    @torch.no_grad()
+    def tokens(self, ranges: Tensor) -> Tensor:
+        """The same in inference mode, as float32, computed in bfloat16 if the spec says so."""
+        with torch.autocast(ranges.device.type, torch.bfloat16, enabled=self.spec.bfloat16):
+            return self(ranges).float()
+
+    def digest(self) -> str:
+        """Fingerprint of architecture and weights, by which a policy names its encoder."""
+        h = hashlib.sha256(self.spec.model_dump_json().encode())
+        for tensor in (self.directions, *self.state_dict().values()):
+            h.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        return h.hexdigest()[:16]
+
+
+class Reconstruction(NamedTuple):
+    """Output of the heads; all in units of the image (lengths over ``spec.scale``) or logits."""
+
+    range: Tensor
+    """(B, rows, columns)."""
+    xyz: Tensor
+    """(B, 3 or 0, rows, columns)."""
+    valid: Tensor
+    """(B, rows, columns) logit of a return."""
+    classes: Tensor
+    """(B, 4, rows, columns) one logit per `Label`."""
+
+
+class Decoder(nn.Module):
+    """Deconvolutions from the latent map to the heads, mirroring the encoder's stages.
+
+    The pixels' directions join the last features, so that a head need not memorise the sensor's geometry.
+    """
+
+    directions: Tensor
+
+    def __init__(self, encoder: Encoder) -> None:
+        super().__init__()
+        spec = encoder.spec
+        self._image_shape = encoder.image_shape
+        self._outputs = (1, 3 * spec.cartesian, 1, len(Label))
+        self.register_buffer("directions", encoder.directions.permute(2, 0, 1), persistent=False)
+        before = spec.widths[-1]
+        layers: list[nn.Module] = [nn.Conv2d(spec.latent, before, 3, 1, 1), nn.ReLU()]
+        for width, stride in zip((*spec.widths[-2::-1], spec.widths[0]), spec.strides[::-1], strict=True):
+            layers += [nn.ConvTranspose2d(before, width, stride, stride), nn.ReLU()]
+            layers += [nn.Conv2d(width, width, 3, 1, 1), nn.ReLU()]
+            before = width
+        self.trunk = nn.Sequential(*layers)
+        self.heads = nn.Conv2d(before + 3, sum(self._outputs), 1)
+
+    def forward(self, latent: Tensor) -> Reconstruction:
+        """Reconstruction from a latent map (B, latent, map rows, map columns)."""
+        rows, columns = self._image_shape
+        features = self.trunk(latent)[:, :, :rows, :columns]
+        geometry = self.directions.expand(len(latent), -1, -1, -1)
+        ranges, xyz, valid, classes = self.heads(torch.cat([features, geometry], 1)).split(self._outputs, 1)
+        return Reconstruction(ranges.squeeze(1), xyz, valid.squeeze(1), classes)
+
+
+class Autoencoder(nn.Module):
+    """Encoder and decoder."""
+
+    def __init__(self, spec: EncoderSpec, directions: Tensor) -> None:
+        super().__init__()
+        self.encoder = Encoder(spec, directions)
+        self.decoder = Decoder(self.encoder)
+
+
+def save(path: Path, model: Autoencoder, extra: dict[str, Any] | None = None) -> None:
+    """Write a checkpoint in one step; ``extra`` is whatever its writer needs to go on."""
+    buffer = io.BytesIO()
+    content = {
+        "format": FORMAT,
+        "spec": model.encoder.spec.model_dump_json(),
+        "directions": model.encoder.directions,
+        "weights": model.state_dict(),
+        **(extra or {}),
+    }
+    torch.save(content, buffer)
+    files.write(path, buffer.getvalue())
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Content of a checkpoint.
+
+    Raises:
+        RomnavError: The file is missing, torn or no encoder checkpoint.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise RomnavError(f"{path}: no such encoder checkpoint; make it by `romnav train encoder`") from None
+    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        raise RomnavError(f"{path}: truncated or no checkpoint; delete it and {AGAIN}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise RomnavError(f"{path}: key 'format' is not {FORMAT!r}; {AGAIN}")
+    return content
+
+
+def load_autoencoder(path: Path, device: str = "cpu") -> Autoencoder:
+    """Encoder and decoder of a checkpoint, in evaluation mode.
+
+    Raises:
+        RomnavError: As `read`, or the weights do not fit the architecture.
+    """
+    content = read(path)
+    try:
+        spec = EncoderSpec.model_validate_json(content["spec"])
+        model = Autoencoder(spec, content["directions"])
+        model.load_state_dict(content["weights"])
+    except KeyError as error:
+        raise RomnavError(f"{path}: key {error} is missing; {AGAIN}") from error
+    except ValidationError as error:
+        key = ".".join(map(str, error.errors()[0]["loc"]))
+        raise RomnavError(f"{path}: key 'spec.{key}' is of another version; {AGAIN}") from error
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise RomnavError(f"{path}: weights of another architecture ({reason}); {AGAIN}") from error
+    return model.to(device).eval()
+
+
+def load(path: Path, spec: EncoderSpec | None = None, device: str = "cpu") -> Encoder:
+    """Encoder of a checkpoint, frozen.
+
+    Raises:
+        RomnavError: As `load_autoencoder`, or the checkpoint is of another architecture than ``spec``.
+    """
+    encoder = load_autoencoder(path, device).encoder
+    if spec is not None and encoder.spec != spec:
+        mine, theirs = spec.model_dump(), encoder.spec.model_dump()
+        key = next(k for k in mine if mine[k] != theirs[k])
+        raise RomnavError(
+            f"{path}: key 'encoder.{key}' is {theirs[key]} in the checkpoint but {mine[key]} in the spec; "
+            f"change the spec or {AGAIN}"
+        )
+    return encoder.requires_grad_(False)
