@@ -1,0 +1,276 @@
+"""From a point cloud to a local occupancy grid, inflated by the robot's radius.
+
+The paper rasterises the cloud "after removing the ground" (Sec. "Poisson Safety Filter"). On slopes, stairs and
+landings no plane is the ground, so it is grown here from under the robot's feet over a coarse height map: a
+neighbouring cell belongs to it if its lowest return is within a step of it. What is not ground in that sense (a
+table top, the storey below a railing) inherits the ground next to it; a return is an obstacle if it lies more than
+a step above the ground of its cell and lower than the robot's height.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from romnav.errors import RomnavError
+from romnav.safety.spec import OccupancySpec
+
+wp.config.quiet = True
+
+# Occupancy cells along a side of a ground cell: enough returns in each on the ground a few metres away.
+_GROUND_CELLS = wp.constant(2)
+_UNSEEN = wp.constant(wp.inf)
+
+
+@wp.kernel(enable_backward=False)
+def _lowest(
+    points: wp.array2d(dtype=wp.vec3),
+    valid: wp.array2d(dtype=wp.bool),
+    half: float,
+    cell: float,
+    lowest: wp.array3d(dtype=float),
+    used: wp.array(dtype=int),
+    broken: wp.array(dtype=int),
+):
+    """Lowest return of every ground cell; valid and non-finite returns counted."""
+    b, k = wp.tid()
+    if not valid[b, k]:
+        return
+    p = points[b, k]
+    if not wp.isfinite(p):
+        wp.atomic_add(broken, b, 1)
+        return
+    wp.atomic_add(used, b, 1)
+    i = int(wp.floor((p[0] + half) / cell))
+    j = int(wp.floor((p[1] + half) / cell))
+    if i >= 0 and j >= 0 and i < lowest.shape[1] and j < lowest.shape[2]:
+        wp.atomic_min(lowest, b, i, j, p[2])
+
+
+@wp.kernel(enable_backward=False)
+def _grow(
+    lowest: wp.array3d(dtype=float),
+    cell: float,
+    step: float,
+    slope: float,
+    queue: wp.array2d(dtype=int),
+    gap: wp.array3d(dtype=float),
+    ground: wp.array3d(dtype=float),
+):
+    """Ground height of every cell, breadth first from the robot's feet at height zero.
+
+    The tolerance is a step, and the steepest rise over cells without a return since the last that was ground.
+    """
+    b = wp.tid()
+    n = lowest.shape[1]
+    centre = n // 2
+    ground[b, centre, centre] = 0.0
+    gap[b, centre, centre] = 0.0
+    queue[b, 0] = centre * n + centre
+    head = int(0)
+    tail = int(1)
+    while head < tail:
+        here = queue[b, head]
+        head += 1
+        i = here // n
+        j = here % n
+        z = ground[b, i, j]
+        unseen = gap[b, i, j]
+        for k in range(9):
+            ni = i + k // 3 - 1
+            nj = j + k % 3 - 1
+            if ni >= 0 and nj >= 0 and ni < n and nj < n and gap[b, ni, nj] < 0.0:
+                low = lowest[b, ni, nj]
+                if low == _UNSEEN:
+                    ground[b, ni, nj] = z
+                    gap[b, ni, nj] = unseen + cell * wp.length(wp.vec2(float(ni - i), float(nj - j)))
+                elif wp.abs(low - z) <= step + slope * unseen:
+                    ground[b, ni, nj] = low
+                    gap[b, ni, nj] = 0.0
+                else:
+                    ground[b, ni, nj] = z
+                    gap[b, ni, nj] = unseen
+                queue[b, tail] = ni * n + nj
+                tail += 1
+
+
+@wp.kernel(enable_backward=False)
+def _mark(
+    points: wp.array2d(dtype=wp.vec3),
+    valid: wp.array2d(dtype=wp.bool),
+    ground: wp.array3d(dtype=float),
+    half: float,
+    cell: float,
+    step: float,
+    height: float,
+    occupied: wp.array3d(dtype=wp.bool),
+):
+    b, k = wp.tid()
+    p = points[b, k]
+    if not valid[b, k] or not wp.isfinite(p):
+        return
+    i = int(wp.floor((p[0] + half) / cell))
+    j = int(wp.floor((p[1] + half) / cell))
+    if i < 0 or j < 0 or i >= occupied.shape[1] or j >= occupied.shape[2]:
+        return
+    above = p[2] - ground[b, i // _GROUND_CELLS, j // _GROUND_CELLS]
+    if above > step and above <= height:
+        occupied[b, i, j] = True
+
+
+@wp.kernel(enable_backward=False)
+def _distances(occupied: wp.array3d(dtype=wp.bool), distance: wp.array3d(dtype=int)):
+    """Along one row, cells to the nearest occupied one."""
+    b, i = wp.tid()
+    n = occupied.shape[2]
+    since = int(1 << 14)
+    for j in range(n):
+        since = wp.where(occupied[b, i, j], 0, since + 1)
+        distance[b, i, j] = since
+    since = int(1 << 14)
+    for k in range(n):
+        j = n - 1 - k
+        since = wp.where(occupied[b, i, j], 0, since + 1)
+        distance[b, i, j] = wp.min(distance[b, i, j], since)
+
+
+@wp.kernel(enable_backward=False)
+def _dilate(
+    distance: wp.array3d(dtype=int), half_width: wp.array(dtype=int), reach: int, inflated: wp.array3d(dtype=wp.bool)
+):
+    """A cell is in the disc of an occupied cell if in some row the nearest one is within the disc's half width."""
+    b, i = wp.tid()
+    n = inflated.shape[2]
+    for j in range(n):
+        inflated[b, i, j] = False
+    for r in range(wp.max(0, i - reach), wp.min(inflated.shape[1], i + reach + 1)):
+        width = half_width[wp.abs(r - i)]
+        for j in range(n):
+            if distance[b, r, j] <= width:
+                inflated[b, i, j] = True
+
+
+def inflate(occupied: torch.Tensor, radius: float) -> torch.Tensor:
+    """Occupancy dilated by an exact disc: all cells whose centre is within ``radius`` of an occupied cell's centre.
+
+    Args:
+        occupied: (B, rows, columns) bool.
+        radius: In cells.
+    """
+    if occupied.ndim != 3 or occupied.dtype != torch.bool:
+        raise RomnavError(f"occupancy is {occupied.dtype} {tuple(occupied.shape)}; expected bool (B, rows, columns)")
+    reach = int(radius)
+    # Least squares of integers against the square of the radius: no rounding at the disc's rim.
+    widths = [math.isqrt(int(radius * radius + 1e-9) - k * k) for k in range(reach + 1)]
+    device = str(occupied.device)
+    distance = torch.empty(occupied.shape, dtype=torch.int32, device=device)
+    inflated = torch.empty_like(occupied)
+    rows = occupied.shape[:2]
+    into = wp.from_torch(distance)
+    wp.launch(_distances, dim=rows, inputs=[wp.from_torch(occupied.contiguous())], outputs=[into], device=device)
+    wp.launch(
+        _dilate,
+        dim=rows,
+        inputs=[into, wp.array(widths, dtype=int, device=device), reach],
+        outputs=[wp.from_torch(inflated)],
+        device=device,
+    )
+    return inflated
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Local occupancy of every robot: rows along x (ahead), columns along y (left), the robot in the middle."""
+
+    occupied: torch.Tensor
+    """(B, n, n) bool, cells with a return off an obstacle."""
+    inflated: torch.Tensor
+    """(B, n, n) bool, cells where the robot's centre must not be."""
+    ground: torch.Tensor
+    """(B, n/2, n/2) height of the ground, m."""
+    used: torch.Tensor
+    """(B,) number of valid returns."""
+    broken: torch.Tensor
+    """(B,) number of valid returns that are NaN or infinite; they are left out."""
+
+
+class Rasterizer:
+    """Point clouds of ``robots`` robots to occupancy grids around them.
+
+    Raises:
+        RomnavError: The grid does not hold the robot, or the robot is smaller than a cell.
+    """
+
+    def __init__(self, robots: int, spec: OccupancySpec | None = None, device: str = "cpu") -> None:
+        self.spec = spec = spec or OccupancySpec()
+        if spec.radius < spec.cell:
+            raise RomnavError(
+                f"occupancy.radius {spec.radius} m is smaller than occupancy.cell {spec.cell} m; choose smaller cells"
+            )
+        coarse = round(spec.size / (_GROUND_CELLS * spec.cell))
+        cells = _GROUND_CELLS * coarse
+        self._reach = spec.radius + spec.margin
+        if cells * spec.cell <= 4 * self._reach:
+            raise RomnavError(
+                f"occupancy.size {spec.size} m is too small for a robot of radius {spec.radius} m and a margin of "
+                f"{spec.margin} m; at least four times their sum is needed"
+            )
+        self.shape = (cells, cells)
+        self.centre = (cells - 1) * spec.cell / 2
+        """Where the robot stands, from the centre of cell (0, 0), along both axes, m."""
+        self._robots = robots
+        self._device = device
+        self._lowest = torch.empty(robots, coarse, coarse, device=device)
+        self._gap = torch.empty_like(self._lowest)
+        self._queue = wp.empty((robots, coarse * coarse), dtype=int, device=device)
+
+    def __call__(self, points: torch.Tensor, valid: torch.Tensor | None = None) -> Occupancy:
+        """Rasterise one cloud per robot.
+
+        Args:
+            points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the ground
+                beneath the robot's centre.
+            valid: (B, N) bool, which returns to use (padding is invalid); all by default.
+        """
+        if points.ndim != 3 or len(points) != self._robots or points.shape[2] != 3:
+            raise RomnavError(f"points have shape {tuple(points.shape)}; expected ({self._robots}, N, 3)")
+        spec, device = self.spec, self._device
+        if valid is None:
+            valid = torch.ones(points.shape[:2], dtype=torch.bool, device=device)
+        if valid.shape != points.shape[:2] or valid.dtype != torch.bool:
+            raise RomnavError(f"valid is {valid.dtype} {tuple(valid.shape)}; expected bool {tuple(points.shape[:2])}")
+        cloud = wp.from_torch(points.float().contiguous(), dtype=wp.vec3)
+        mask = wp.from_torch(valid.contiguous())
+        used, broken = torch.zeros(2, self._robots, dtype=torch.int32, device=device)
+        ground = torch.empty_like(self._lowest)
+        occupied = torch.zeros(self._robots, *self.shape, dtype=torch.bool, device=device)
+        self._lowest.fill_(torch.inf)
+        self._gap.fill_(-1.0)
+        lowest, surface = wp.from_torch(self._lowest), wp.from_torch(ground)
+        half, coarse = self.shape[0] * spec.cell / 2, _GROUND_CELLS * spec.cell
+        wp.launch(
+            _lowest,
+            dim=cloud.shape,
+            inputs=[cloud, mask, half, coarse],
+            outputs=[lowest, wp.from_torch(used), wp.from_torch(broken)],
+            device=device,
+        )
+        wp.launch(
+            _grow,
+            dim=self._robots,
+            inputs=[lowest, coarse, spec.step, spec.slope, self._queue],
+            outputs=[wp.from_torch(self._gap), surface],
+            device=device,
+        )
+        wp.launch(
+            _mark,
+            dim=cloud.shape,
+            inputs=[cloud, mask, surface, half, spec.cell, spec.step, spec.height],
+            outputs=[wp.from_torch(occupied)],
+            device=device,
+        )
+        inflated = inflate(occupied, self._reach / spec.cell)
+        return Occupancy(occupied, inflated, ground, used, broken)
