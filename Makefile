@@ -1,0 +1,36 @@
+# Every target is one command; what it needs comes with it.
+SCALE ?= smoke
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: setup demo test check tables bench nightly
+
+setup: .venv/stamp
+
+.venv/stamp: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "error: $(PYTHON) is older than 3.11; use make PYTHON=python3.11"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/romnav run ablation spawn-goal --scale smoke
+
+test: setup
+	$(BIN)/pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+tables: setup
+	$(BIN)/romnav tables --scale $(SCALE)
+
+bench: setup
+	$(BIN)/romnav bench
+
+nightly: setup
+	$(BIN)/romnav --results .cache/nightly run ablation spawn-goal --scale $(SCALE) --no-resume
+	$(BIN)/romnav --results .cache/nightly check --scale $(SCALE)

@@ -1,0 +1,3 @@
+from romnav.cli import main
+
+main()

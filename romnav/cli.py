@@ -1,0 +1,284 @@
+"""The command line: parses, calls, prints. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from romnav.errors import RomnavError
+
+if TYPE_CHECKING:
+    from romnav.experiment.plan import Plan, Stage
+
+
+class _Group(TyperGroup):
+    """Turns a user's mistake into one line, and Ctrl-C into how to go on."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except RomnavError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            again = shlex.join(["romnav", *(word for word in sys.argv[1:] if word != "--no-resume")])
+            typer.echo(f"\nstopped; what is done is kept, go on with: {again}", err=True)
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Train, evaluate and compare mapless multi-floor navigation policies (RoM-Nav).",
+    epilog="First run: romnav run ablation spawn-goal --scale smoke",
+)
+run = typer.Typer(no_args_is_help=True, help="Run an experiment from training to tables.")
+train = typer.Typer(no_args_is_help=True, help="Train one part.")
+play = typer.Typer(no_args_is_help=True, help="Draw what the parts make.")
+app.add_typer(run, name="run")
+app.add_typer(train, name="train")
+app.add_typer(play, name="play")
+
+ScaleOption = Annotated[
+    str, typer.Option("--scale", help="smoke (minutes), cpu (hours) or paper (the paper's numbers, GPU).")
+]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Training seed; default: those of the experiment.")
+]
+DeviceOption = Annotated[str, typer.Option("--device", help="cpu, cuda or cuda:N.")]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume/--no-resume", help="Go on from what is there, or start over.")
+]
+
+
+@app.callback()
+def _options(
+    ctx: typer.Context,
+    results: Annotated[Path | None, typer.Option(help="Where results lie; default: results/.")] = None,
+) -> None:
+    ctx.obj = results
+
+
+@app.command("list")
+def list_(ctx: typer.Context) -> None:
+    """Show the experiments, their arms, and which training seeds are evaluated at which scale."""
+    from romnav.experiment.project import Project
+
+    typer.echo(Project.here(ctx.obj).overview())
+
+
+@run.command()
+def ablation(
+    ctx: typer.Context,
+    name: Annotated[str, typer.Argument(help="A file under experiments/, see `romnav list`.")],
+    scale: ScaleOption = "smoke",
+    seed: SeedOption = None,
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Train and evaluate every arm of an ablation, then write and print its tables."""
+    from romnav.experiment.run import EVERYTHING
+
+    plan = _plan(ctx, scale)
+    seeds = plan.project.experiment(name).seeds if seed is None else (seed,)
+    tables = plan.tables(name, seeds)
+    _execute(plan, [tables], device, resume, EVERYTHING)
+    _print_tables(tables)
+
+
+@train.command()
+def encoder(
+    ctx: typer.Context,
+    scale: ScaleOption = "smoke",
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Pretrain the LiDAR encoder."""
+    plan = _plan(ctx, scale)
+    _execute(plan, [plan.encoder()], device, resume, {"encoder"})
+
+
+@train.command()
+def policy(
+    ctx: typer.Context,
+    arm: Annotated[str, typer.Argument(help="An arm of an experiment, see `romnav list`.")],
+    scale: ScaleOption = "smoke",
+    seed: SeedOption = None,
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Train the navigation policy of an arm, and its encoder if that is missing."""
+    plan = _plan(ctx, scale)
+    seeds = plan.project.seeds(arm) if seed is None else (seed,)
+    _execute(plan, [plan.policy(arm, s) for s in seeds], device, resume, {"policy"})
+
+
+@app.command("eval")
+def evaluate(
+    ctx: typer.Context,
+    arms: Annotated[list[str], typer.Argument(help="Trained arms, or the scripted ones: oracle, straight.")],
+    paired: Annotated[bool, typer.Option("--paired", help="Compare the arms episode by episode.")] = False,
+    scale: ScaleOption = "smoke",
+    seed: SeedOption = None,
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Evaluate arms on the episode set that all arms share."""
+    from romnav.experiment.run import require_trained
+
+    plan = _plan(ctx, scale)
+    stages = [
+        plan.episodes(arm, s) for arm in arms for s in (plan.project.seeds(arm) if seed is None else (seed,))
+    ]
+    require_trained(stages)
+    _execute(plan, stages, device, resume, {"episodes"})
+    _print_results(_collect(ctx, scale), arms, paired)
+
+
+@app.command()
+def results(
+    ctx: typer.Context,
+    scale: ScaleOption = "smoke",
+    json: Annotated[bool, typer.Option("--json", help="As JSON, for scripts.")] = False,
+) -> None:
+    """Print every evaluated arm and every paired contrast of a scale."""
+    collected = _collect(ctx, scale)
+    if json:
+        from json import dumps
+
+        typer.echo(dumps(collected, indent=2))
+    else:
+        _print_results(collected, [], contrasts=True)
+
+
+@app.command()
+def tables(
+    ctx: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="Experiment; default: all.")] = None,
+    scale: ScaleOption = "smoke",
+) -> None:
+    """Write the tables again from recorded episode rows; nothing is trained or evaluated."""
+    plan = _plan(ctx, scale)
+    for experiment in [name] if name else plan.project.experiments:
+        stage = plan.tables(experiment, plan.project.experiment(experiment).seeds)
+        _perform(plan, [stage], "cpu", True)
+        _print_tables(stage)
+
+
+@app.command()
+def check(ctx: typer.Context, scale: ScaleOption = "smoke") -> None:
+    """Hold the results against the bands in results/<scale>/bands.json (nightly regression)."""
+    from romnav.experiment.bands import check
+
+    bands = _plan(ctx, scale).project.root / "results" / scale / "bands.json"
+    typer.echo("\n".join(check(_collect(ctx, scale), bands)))
+
+
+@play.command()
+def world(
+    ctx: typer.Context,
+    seed: Annotated[int, typer.Option(help="Seed of the generator.")] = 0,
+    tile: Annotated[int, typer.Option(min=0, help="Which tile of that seed; the classes take turns.")] = 0,
+    scale: ScaleOption = "smoke",
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
+) -> None:
+    """Draw a tile of the terrain in 3D beside its occupancy grids."""
+    from romnav.report.pictures import draw_tile
+    from romnav.world.tiles import generate
+
+    plan = _plan(ctx, scale)
+    path = out or plan.folder / "figures" / f"world-{seed}-{tile}.png"
+    draw_tile(*generate(plan.scale.settings.world.model_copy(update={"seed": seed}), tile), path)
+    typer.echo(path)
+
+
+@app.command()
+def bench(
+    ctx: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="A file under benchmarks/; default: all.")] = None,
+) -> None:
+    """Time a part beside its peers."""
+    import subprocess
+
+    from romnav.experiment.project import Project
+    from romnav.experiment.spec import suggest
+
+    folder = Project.here(ctx.obj).root / "benchmarks"
+    files = {file.stem: file for file in sorted(folder.glob("[!_]*.py"))}
+    if name and name not in files:
+        raise RomnavError(f"unknown benchmark {name}{suggest(name, files)}")
+    for benchmark in [name] if name else files:
+        typer.echo(f"== {benchmark}")
+        if subprocess.run([sys.executable, files[benchmark]]).returncode:
+            raise RomnavError(f"{files[benchmark]}: failed")
+
+
+def main() -> None:
+    """Entry point of ``romnav``."""
+    app()
+
+
+def _plan(ctx: typer.Context, scale: str) -> Plan:
+    from romnav.experiment.plan import Plan
+    from romnav.experiment.project import Project
+    from romnav.experiment.scales import ScaleFile
+
+    project = Project.here(ctx.obj)
+    return Plan(project, ScaleFile(project.root / "experiments" / "scales", scale))
+
+
+def _execute(plan: Plan, targets: list[Stage], device: str, resume: bool, kinds: Collection[str]) -> None:
+    """Runs what the targets need; without ``resume``, stages of the given ``kinds`` start over."""
+    from romnav.experiment.run import pending
+
+    stages = pending(targets, () if resume else kinds)
+    if not stages:
+        typer.echo("nothing to do: everything is finished and up to date", err=True)
+    _perform(plan, stages, device, resume)
+
+
+def _perform(plan: Plan, stages: list[Stage], device: str, resume: bool) -> None:
+    from romnav.experiment.run import execute
+    from romnav.experiment.stages import Stages
+
+    execute(stages, Stages(plan, device, resume).actions, resume, lambda line: typer.echo(line, err=True))
+
+
+def _print_tables(stage: Stage) -> None:
+    for name in stage.outputs:
+        if name.endswith(".md"):
+            typer.echo((stage.folder / name).read_text("utf-8"))
+    typer.echo(f"tables: {stage.folder}", err=True)
+
+
+def _collect(ctx: typer.Context, scale: str) -> dict[str, Any]:
+    from romnav.report.results import collect
+
+    return collect(_plan(ctx, scale).project.results, scale)
+
+
+def _print_results(collected: dict[str, Any], arms: list[str], contrasts: bool) -> None:
+    """Prints metrics (percent, s) and contrasts (percentage points), of ``arms`` only unless empty."""
+    from rich.console import Console
+    from rich.table import Table
+
+    chosen = [run for run in collected["arms"] if not arms or run["arm"] in arms]
+    tables = [chosen]
+    if contrasts:
+        names = {run["arm"] for run in chosen}
+        once = [c for c in collected["contrasts"] if c["a"] < c["b"]]
+        tables.append([c for c in once if {c["a"], c["b"]} <= names])
+    for rows in filter(None, tables):
+        table = Table(*rows[0])
+        for row in rows:
+            table.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v or "–") for v in row.values()))
+        Console().print(table)
+    typer.echo(f"scale {collected['scale']}, episode set {collected['episode_set']}")

@@ -1,0 +1,178 @@
+"""Which stage needs which, and which settings its output depends on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from romnav.config import Config
+from romnav.experiment.project import Project
+from romnav.experiment.scales import Scale, ScaleFile
+from romnav.experiment.spec import SCRIPTED
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of an experiment: files in a folder, made from settings and the output of other stages."""
+
+    kind: str
+    """Which function makes it."""
+    name: str
+    """Unique within a scale, as shown to the user."""
+    folder: Path
+    """Where its output lies."""
+    outputs: tuple[str, ...]
+    """Files that it writes into its folder."""
+    record: Path
+    """File that tells what made the output."""
+    settings: Config
+    """All settings of the scale, with the arm's changes."""
+    uses: tuple[str, ...]
+    """Dotted names of the settings that its output depends on."""
+    reads: tuple[Path, ...] = ()
+    """Versioned files that its output depends on."""
+    upstream: tuple[Stage, ...] = ()
+    """Stages whose output it reads."""
+    scratch: tuple[str, ...] = ()
+    """Files from which an interrupted run continues; useless once a setting has changed."""
+    arm: str | None = None
+    """Arm that it trains or evaluates."""
+    seed: int | None = None
+    """Training seed of the arm."""
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """Everything that determines the output beside the upstream stages, as plain data."""
+        used = {name: attrgetter(name)(self.settings) for name in self.uses}
+        plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in used.items()}
+        read = {path.name: digest(path) if path.exists() else None for path in self.reads}
+        return {"arm": self.arm, "seed": self.seed, **plain, **read}
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of the specification and of every upstream key."""
+        text = json.dumps([self.kind, self.spec, [stage.key for stage in self.upstream]], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The stages of one scale."""
+
+    project: Project
+    scale: ScaleFile
+
+    @property
+    def folder(self) -> Path:
+        """Results of this scale."""
+        return self.project.results / self.scale.name
+
+    @property
+    def episode_set(self) -> Path:
+        """The initial conditions that all arms share."""
+        return (
+            self.project.root / "experiments" / "episodes" / f"{self.scale.settings.evaluation.episodes}.json"
+        )
+
+    def settings(self, arm: str) -> Scale:
+        """The scale's settings with the changes of a trained arm.
+
+        Raises:
+            RomnavError: No experiment has this arm, or its changes are invalid.
+        """
+        name, experiment = self.project.having(arm)
+        return self.scale.changed(
+            arm, experiment.arms[arm], self.project.root / "experiments" / f"{name}.toml"
+        )
+
+    def encoder(self, settings: Scale | None = None) -> Stage:
+        """The LiDAR encoder; an arm that changes it gets one of its own."""
+        stage = Stage(
+            kind="encoder",
+            name="encoder lidar",
+            folder=self.folder / "encoder" / "lidar",
+            outputs=("encoder.pt",),
+            record=self.folder / "encoder" / "lidar" / "encoder.json",
+            settings=settings or self.scale.settings,
+            uses=("world", "lidar", "pretrain"),
+            scratch=("checkpoint.pt",),
+        )
+        if settings is None or stage.key == self.encoder().key:
+            return stage
+        folder = stage.folder.with_name(f"lidar-{stage.key[:8]}")
+        return replace(stage, name=f"encoder {folder.name}", folder=folder, record=folder / "encoder.json")
+
+    def policy(self, arm: str, seed: int) -> Stage:
+        """The trained policy of an arm."""
+        settings = self.settings(arm)
+        folder = self.folder / arm / f"seed-{seed}"
+        return Stage(
+            kind="policy",
+            name=f"policy {arm}, seed {seed}",
+            folder=folder,
+            outputs=("policy.pt", "curve.csv"),
+            record=folder / "spec.json",
+            settings=settings,
+            uses=("world", "lidar", "navigation"),
+            upstream=(self.encoder(settings),),
+            scratch=("checkpoint.pt", "curve.csv"),
+            arm=arm,
+            seed=seed,
+        )
+
+    def episodes(self, arm: str, seed: int) -> Stage:
+        """The evaluated episodes of a trained or scripted arm."""
+        upstream: tuple[Stage, ...] = ()
+        uses: tuple[str, ...] = ("evaluation",)
+        if arm in SCRIPTED:
+            seed, settings = 0, self.scale.settings
+            uses += ("navigation.dynamics", "navigation.env")
+        else:
+            policy = self.policy(arm, seed)
+            settings = policy.settings
+            upstream = (*policy.upstream, policy)
+        folder = self.folder / arm / f"seed-{seed}"
+        return Stage(
+            kind="episodes",
+            name=f"episodes {arm}, seed {seed}",
+            folder=folder,
+            outputs=("episodes.parquet",),
+            record=folder / "episodes.json",
+            settings=settings,
+            uses=uses,
+            reads=(self.episode_set,),
+            upstream=upstream,
+            arm=arm,
+            seed=seed,
+        )
+
+    def tables(self, name: str, seeds: Iterable[int]) -> Stage:
+        """The tables of an experiment."""
+        experiment = self.project.experiment(name)
+        arms = [(arm, seed) for arm in experiment.arms for seed in seeds]
+        return Stage(
+            kind="tables",
+            name=f"tables {name}",
+            folder=self.folder / "tables",
+            outputs=tuple(
+                f"{table}.{format}" for table in experiment.tables for format in ("tex", "md", "csv")
+            ),
+            record=self.folder / "tables" / f"{name}.json",
+            settings=experiment,
+            uses=("tables",),
+            upstream=tuple(
+                self.episodes(arm, seed) for arm, seed in [*arms, *((arm, 0) for arm in SCRIPTED)]
+            ),
+        )
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

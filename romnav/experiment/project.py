@@ -1,0 +1,82 @@
+"""A project folder: its experiments, scales and results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from romnav.errors import RomnavError
+from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, suggest
+
+
+@dataclass(frozen=True)
+class Project:
+    """What is compared, and where the results lie."""
+
+    root: Path
+    """Folder with experiments/."""
+    results: Path
+    """Folder with one folder per scale."""
+
+    @classmethod
+    def here(cls, results: Path | None = None) -> Project:
+        """The project that the current folder is in.
+
+        Raises:
+            RomnavError: There is none.
+        """
+        folder = Path.cwd()
+        for root in (folder, *folder.parents):
+            if (root / "experiments" / "scales").is_dir():
+                return cls(root, results or root / "results")
+        raise RomnavError(
+            f"{folder}: no experiments/ here or above; change to a copy of the romnav repository"
+        )
+
+    @cached_property
+    def experiments(self) -> dict[str, Experiment]:
+        """Experiments by name."""
+        return load_experiments(self.root / "experiments")
+
+    def experiment(self, name: str) -> Experiment:
+        """One experiment.
+
+        Raises:
+            RomnavError: There is none of this name.
+        """
+        if name not in self.experiments:
+            raise RomnavError(f"unknown experiment {name}{suggest(name, self.experiments)}")
+        return self.experiments[name]
+
+    def having(self, arm: str) -> tuple[str, Experiment]:
+        """An experiment that has a trained arm.
+
+        Raises:
+            RomnavError: None has it.
+        """
+        for name, experiment in self.experiments.items():
+            if arm in experiment.arms:
+                return name, experiment
+        known = {name for experiment in self.experiments.values() for name in experiment.arms}
+        raise RomnavError(f"unknown arm {arm}{suggest(arm, {*known, *SCRIPTED})}")
+
+    def seeds(self, arm: str) -> tuple[int, ...]:
+        """Training seeds of an arm; a scripted one has only seed 0."""
+        return (0,) if arm in SCRIPTED else self.having(arm)[1].seeds
+
+    def overview(self) -> str:
+        """Experiments, arms, and the training seeds evaluated at each scale, as text."""
+        lines = []
+        for name, experiment in self.experiments.items():
+            lines.append(f"{name}: {experiment.title} ({experiment.kind})")
+            labels = [*((arm, spec.label) for arm, spec in experiment.arms.items())]
+            labels += [(arm, "(scripted)") for arm in SCRIPTED]
+            lines += [f"  {arm:<16} {label:<22} {self._evaluated(arm)}".rstrip() for arm, label in labels]
+        return "\n".join(lines)
+
+    def _evaluated(self, arm: str) -> str:
+        found: dict[str, list[int]] = {}
+        for file in sorted(self.results.glob(f"*/{arm}/seed-*/episodes.parquet")):
+            found.setdefault(file.parts[-4], []).append(int(file.parts[-2].removeprefix("seed-")))
+        return "; ".join(f"{scale}: seed {', '.join(map(str, seeds))}" for scale, seeds in found.items())

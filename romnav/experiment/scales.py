@@ -1,0 +1,65 @@
+"""How large everything is: one TOML file per scale, a section per part, validated by the part's own spec."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from romnav.config import Config
+from romnav.errors import RomnavError
+from romnav.evaluation.spec import EvaluationSpec
+from romnav.experiment.spec import Arm, parse, read_toml, suggest
+from romnav.navigation.spec import NavigationSpec
+from romnav.sensing.spec import LidarSpec, PretrainSpec
+from romnav.world.spec import WorldSpec
+
+
+class Scale(Config):
+    """The settings of every part; the defaults are the paper's, or assumed where it is silent."""
+
+    world: WorldSpec = WorldSpec()
+    """Training terrain."""
+    lidar: LidarSpec = LidarSpec()
+    """Range image."""
+    pretrain: PretrainSpec = PretrainSpec()
+    """Encoder and its training."""
+    navigation: NavigationSpec = NavigationSpec()
+    """Task, policy and reinforcement learning."""
+    evaluation: EvaluationSpec = EvaluationSpec()
+    """Evaluation terrain and episodes."""
+
+
+class ScaleFile:
+    """A scale, and what becomes of it when an arm changes some of its settings.
+
+    Raises:
+        RomnavError: There is no such scale, or its file is invalid.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        file = folder / f"{name}.toml"
+        if not file.is_file():
+            raise RomnavError(f"unknown scale {name}{suggest(name, (f.stem for f in folder.glob('*.toml')))}")
+        self.name = name
+        self._data = read_toml(file)
+        self.settings = parse(Scale, self._data, file)
+
+    def changed(self, name: str, arm: Arm, file: Path) -> Scale:
+        """The settings of arm ``name`` of the experiment in ``file``.
+
+        Raises:
+            RomnavError: The arm changes a setting that does not exist, or to a value of a wrong type.
+        """
+        if "evaluation" in arm.changes:
+            raise RomnavError(f"{file}: arms.{name}.evaluation: set it in the scale, all arms share it")
+        return parse(Scale, _merge(self._data, arm.changes), file, f"arms.{name}.")
+
+
+def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        below = merged.get(key)
+        nested = isinstance(value, dict) and isinstance(below, dict)
+        merged[key] = _merge(below, value) if nested else value
+    return merged

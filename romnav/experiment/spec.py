@@ -1,0 +1,138 @@
+"""What is compared: one TOML file per experiment, typed, with errors that a user can act on."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError, field_validator
+
+from romnav.config import Config
+from romnav.errors import RomnavError
+
+SCRIPTED = ("oracle", "straight")
+"""Arms that need no training; every ablation is evaluated beside them."""
+RESERVED = {*SCRIPTED, "encoder", "tables", "figures"}
+"""Names of other folders beside those of the arms."""
+
+C = TypeVar("C", bound=Config)
+
+
+class Arm(Config, extra="allow"):
+    """One arm: its label, and the scale's settings that it changes, e.g. ``navigation.ppo.gamma = 0.99``."""
+
+    label: str
+    """Name in lists."""
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Settings that differ from the scale's, nested by section."""
+        return self.model_extra or {}
+
+
+class Experiment(Config):
+    """Arms that are trained alike except for their changes, and evaluated on the same episodes."""
+
+    kind: Literal["ablation"]
+    """What is done with the arms."""
+    title: str
+    """One line for lists."""
+    tables: tuple[str, ...]
+    """Tables to write from the episode rows."""
+    seeds: tuple[int, ...] = (0,)
+    """Training seeds of every arm."""
+    arms: dict[str, Arm]
+    """Arms by the name of their results folder."""
+
+    @field_validator("arms")
+    @classmethod
+    def _free_names(cls, arms: dict[str, Arm]) -> dict[str, Arm]:
+        if taken := {*arms} & RESERVED:
+            raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
+        return arms
+
+
+def load_experiments(folder: Path) -> dict[str, Experiment]:
+    """Reads every ``<folder>/<name>.toml``.
+
+    Raises:
+        RomnavError: A file is invalid, or two experiments give one arm different settings.
+    """
+    experiments = {
+        file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))
+    }
+    seen: dict[str, tuple[str, Arm]] = {}
+    for name, experiment in experiments.items():
+        for arm_name, arm in experiment.arms.items():
+            first, same = seen.setdefault(arm_name, (name, arm))
+            if same.changes != arm.changes:
+                raise RomnavError(
+                    f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
+                )
+    return experiments
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """Reads a TOML file.
+
+    Raises:
+        RomnavError: It is missing or no TOML.
+    """
+    try:
+        return tomllib.loads(file.read_text("utf-8"))
+    except OSError as error:
+        raise RomnavError(f"{file}: cannot be read ({(error.strerror or str(error)).lower()})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RomnavError(f"{file}: not valid TOML: {error}") from error
+
+
+def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "") -> C:
+    """Validates ``data`` from ``file``, where it stands under the dotted ``prefix``.
+
+    Raises:
+        RomnavError: One line with file, key, what is wrong and the nearest valid name.
+    """
+    try:
+        # JSON, since strict validation of Python objects would refuse TOML's arrays for tuples.
+        return model.model_validate_json(json.dumps(data, default=str))
+    except ValidationError as invalid:
+        error = invalid.errors()[0]
+        key = prefix + ".".join(map(str, error["loc"]))
+        raise RomnavError(f"{file}: {_explain(model, key, error)}") from invalid
+
+
+def _explain(model: type[BaseModel], key: str, error: Any) -> str:
+    match error["type"]:
+        case "extra_forbidden":
+            return f"unknown key {key}{suggest(error['loc'][-1], _fields(model, error['loc'][:-1]))}"
+        case "missing":
+            return f"key {key} is missing"
+        case "value_error":
+            return f"{key}: {error['ctx']['error']}".removeprefix(": ")
+        case _:
+            return f"key {key}: {error['msg'][0].lower()}{error['msg'][1:]}, not {error['input']!r}"
+
+
+def _fields(model: type[BaseModel], path: Iterable[Any]) -> list[str]:
+    """Keys of the model that stands at ``path`` in ``model``."""
+    for part in path:
+        if part in model.model_fields:
+            model = _model_in(model.model_fields[part].annotation) or model
+    return list(model.model_fields)
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_model_in, get_args(annotation))), None)
+
+
+def suggest(name: str, names: Iterable[str]) -> str:
+    """Ends an error about an unknown name: the nearest valid one, otherwise all of them."""
+    names = sorted(names)
+    near = difflib.get_close_matches(name, names, n=1)
+    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(names) or 'none'}"

@@ -1,0 +1,179 @@
+"""What lies on disk: the folders of a project, and beside every stage's output a record of what made it."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from romnav import __version__
+from romnav.errors import RomnavError
+from romnav.experiment.plan import Stage, digest
+from romnav.files import write
+
+_PACKAGES = ("torch", "rsl-rl-lib", "mujoco", "warp-lang", "numpy")
+
+
+@dataclass
+class Record:
+    """What made the output of a stage; without ``outputs`` it was begun but not finished."""
+
+    key: str
+    """Hash of the specification and of every upstream key."""
+    spec: dict[str, Any]
+    """Specification, resolved."""
+    upstream: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Digests of the files that the stage read, by the name of the stage that wrote them."""
+    outputs: dict[str, str] = field(default_factory=dict)
+    """Digests of the files that the stage wrote."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What the stage reported of itself, e.g. its training steps."""
+    seconds: float = 0.0
+    """Duration of the session that finished it, s."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Commit, versions and machine."""
+
+
+def read(stage: Stage) -> Record | None:
+    """The record of a stage, if there is one.
+
+    Raises:
+        RomnavError: It is damaged.
+    """
+    try:
+        return Record(**json.loads(stage.record.read_text("utf-8")))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError) as error:
+        raise RomnavError(
+            f"{stage.record}: damaged record ({error}); restore it, or delete it to run the stage again"
+        ) from error
+
+
+def finished(stage: Stage) -> bool:
+    """Whether the output of a stage is there, whole, and made from its present specification.
+
+    Raises:
+        RomnavError: An output is not the file that was recorded.
+    """
+    record = read(stage)
+    if record is None or record.key != stage.key or set(record.outputs) != set(stage.outputs):
+        return False
+    if not all((stage.folder / name).is_file() for name in stage.outputs):
+        return False
+    for name, recorded in record.outputs.items():
+        if digest(stage.folder / name) != recorded:
+            raise RomnavError(
+                f"{stage.folder / name}: not the file that {stage.record.name} recorded (truncated, edited); "
+                "restore it, or delete it to run the stage again"
+            )
+    return all(_unchanged(above, record) for above in stage.upstream)
+
+
+def _unchanged(above: Stage, record: Record) -> bool:
+    """Whether a stage upstream still has the output that was read; its record tells, its files may be gone."""
+    upstream = read(above)
+    return upstream is None or not upstream.outputs or upstream.outputs == record.upstream.get(above.name)
+
+
+def begin(stage: Stage, resume: bool) -> Record:
+    """Marks a stage as begun; drops what an earlier, different run of it left to be resumed.
+
+    Raises:
+        RomnavError: Its folder cannot be written, which is better known before the work than after it.
+    """
+    old = read(stage)
+    if not resume or old is None or old.key != stage.key:
+        for name in stage.scratch:
+            (stage.folder / name).unlink(missing_ok=True)
+    record = Record(stage.key, stage.spec)
+    _write(stage, record)
+    return record
+
+
+def finish(stage: Stage, record: Record, facts: dict[str, Any], seconds: float) -> None:
+    """Records a finished stage."""
+    above = {stage.name: read(stage) for stage in stage.upstream}
+    record.upstream = {name: other.outputs for name, other in above.items() if other}
+    record.outputs = {name: digest(stage.folder / name) for name in stage.outputs}
+    record.facts = facts
+    record.seconds = round(seconds, 1)
+    record.provenance = provenance()
+    _write(stage, record)
+
+
+def _write(stage: Stage, record: Record) -> None:
+    write(stage.record, json.dumps(asdict(record), indent=2) + "\n")
+
+
+def differences(stage: Stage) -> list[str]:
+    """What a stage's specification changed since its record, as ``key: old -> new``."""
+    record = read(stage)
+    if record is None:
+        return []
+    old, new = _flat(record.spec), _flat(stage.spec)
+    return [
+        f"{key}: {old.get(key)} -> {new.get(key)}"
+        for key in sorted({*old, *new})
+        if old.get(key) != new.get(key)
+    ]
+
+
+def _flat(data: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(data, dict):
+        return {prefix: data}
+    return {
+        k: v for key, value in data.items() for k, v in _flat(value, f"{prefix}.{key}".strip(".")).items()
+    }
+
+
+def provenance() -> dict[str, Any]:
+    """Commit, versions and machine of this process."""
+    return {
+        "commit": commit(),
+        "romnav": __version__,
+        "python": platform.python_version(),
+        **{name: _version(name) for name in _PACKAGES},
+        "machine": f"{_processor()}, {os.cpu_count()} threads, {platform.system()} {platform.release()}",
+        "command": shlex.join(["romnav", *sys.argv[1:]]),
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def commit() -> str:
+    """Git commit of the code, with ``-dirty`` where code or experiments differ; "unknown" without git."""
+    root = Path(__file__).parents[2]
+    head = _git(root, "rev-parse", "HEAD")
+    changed = _git(root, "status", "--porcelain", "--", "romnav", "experiments/*.toml", "pyproject.toml")
+    return f"{head or 'unknown'}{'-dirty' if changed else ''}"
+
+
+def _git(root: Path, *arguments: str) -> str:
+    try:
+        return subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True).stdout.strip()
+    except OSError:
+        return ""
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "none"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

@@ -1,0 +1,55 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from romnav.errors import RomnavError
+
+HINTS = {
+    errno.ENOSPC: "free some disk space",
+    errno.EDQUOT: "free some of your disk quota",
+    errno.EACCES: "make its folder writable",
+    errno.EPERM: "make its folder writable",
+    errno.EROFS: "make its folder writable",
+}
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[BinaryIO]:
+    """Opens a file that replaces ``path`` in one step at the end; whoever reads sees the old one or the new.
+
+    Raises:
+        RomnavError: The folder cannot be written or the disk is full; the old file is untouched.
+    """
+    part = path.with_name(f".{path.name}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with part.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def write(path: Path, data: bytes | str) -> None:
+    """Writes a file with ``atomic``; text in UTF-8."""
+    with atomic(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+def unwritable(path: Path, error: OSError) -> RomnavError:
+    """The user's view of a failed write to ``path``."""
+    hint = HINTS.get(error.errno or 0, "check the path and the disk")
+    return RomnavError(f"{path}: cannot be written ({(error.strerror or str(error)).lower()}); {hint}")
