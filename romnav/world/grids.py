@@ -130,7 +130,10 @@ def _blocked_by_solids(
     spec: GridSpec,
 ) -> NDArray[np.bool_]:
     blocked = np.zeros(height.shape, bool)
-    for s in range(len(solids)):
+    low = solids.bottom - np.abs(solids.slope_bottom) * solids.half[:, 0]
+    high = solids.top + np.abs(solids.slope_top) * solids.half[:, 0]
+    relevant = (high > np.nanmin(height)) & (low < np.nanmax(height) + spec.robot_height)
+    for s in map(int, np.flatnonzero(relevant)):
         window, u, _, distance = _footprint(solids, s, centres, spec.robot_radius)
         h, below = height[window], surface[window]
         bottom = solids.bottom[s] + solids.slope_bottom[s] * u

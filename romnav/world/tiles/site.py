@@ -79,26 +79,30 @@ class Floor:
     """Reservations on one storey, on a 0.1 m raster: keeps furniture out of doorways, stairs and other furniture."""
 
     def __init__(self, side: float, cell: float = 0.1) -> None:
-        centres = (np.arange(round(side / cell)) + 0.5) * cell
-        self._x, self._y = np.meshgrid(centres, centres, indexing="ij")
-        self._taken = np.ones(self._x.shape, bool)
+        self._centres = (np.arange(round(side / cell)) + 0.5) * cell
+        self._taken = np.ones((len(self._centres),) * 2, bool)
 
     def open(self, frame: Frame, u: Span, v: Span) -> None:
         """Declare a local rectangle free."""
-        self._taken[self._inside(frame, u, v)] = False
+        window, inside = self._inside(frame, u, v)
+        self._taken[window][inside] = False
 
     def reserve(self, frame: Frame, u: Span, v: Span, margin: float = 0.0) -> None:
         """Take a local rectangle, grown by ``margin``."""
-        self._taken[self._inside(frame, (u[0] - margin, u[1] + margin), (v[0] - margin, v[1] + margin))] = (
-            True
-        )
+        window, inside = self._inside(frame, (u[0] - margin, u[1] + margin), (v[0] - margin, v[1] + margin))
+        self._taken[window][inside] = True
 
     def fits(self, frame: Frame, u: Span, v: Span) -> bool:
         """Whether nothing is taken inside a local rectangle."""
-        return not self._taken[self._inside(frame, u, v)].any()
+        window, inside = self._inside(frame, u, v)
+        return not (self._taken[window] & inside).any()
 
-    def _inside(self, frame: Frame, u: Span, v: Span) -> NDArray[np.bool_]:
+    def _inside(self, frame: Frame, u: Span, v: Span) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+        corners = np.array([frame.at(a, b) for a in u for b in v])
+        low = np.searchsorted(self._centres, corners.min(axis=0))
+        high = np.searchsorted(self._centres, corners.max(axis=0))
+        window = (slice(low[0], high[0]), slice(low[1], high[1]))
         c, s = np.cos(frame.yaw), np.sin(frame.yaw)
-        dx, dy = self._x - frame.x, self._y - frame.y
+        dx, dy = self._centres[window[0], None] - frame.x, self._centres[None, window[1]] - frame.y
         lu, lv = c * dx + s * dy, c * dy - s * dx
-        return (lu >= u[0]) & (lu <= u[1]) & (lv >= v[0]) & (lv <= v[1])
+        return window, (lu >= u[0]) & (lu <= u[1]) & (lv >= v[0]) & (lv <= v[1])
