@@ -79,7 +79,7 @@ def finished(stage: Stage) -> bool:
 
 
 def _unchanged(above: Stage, record: Record) -> bool:
-    """Whether a stage upstream still has the output that was read; its record tells, its files may be gone."""
+    """Whether a stage upstream still has the output that was read; its files may be gone."""
     upstream = read(above)
     return upstream is None or not upstream.outputs or upstream.outputs == record.upstream.get(above.name)
 

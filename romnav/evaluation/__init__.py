@@ -1,0 +1,1 @@
+"""Paired episodes, metrics and statistics."""

@@ -1,0 +1,1 @@
+"""The navigation task, its policy and its training."""

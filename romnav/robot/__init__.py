@@ -1,0 +1,1 @@
+"""Two dynamics behind one interface: the reduced-order model and the humanoid."""

@@ -1,0 +1,1 @@
+"""What the robot sees: LiDAR, its corruption, and the encoders."""

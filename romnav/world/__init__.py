@@ -1,0 +1,1 @@
+"""Terrain: solids, tiles, and everything that is derived from them."""
