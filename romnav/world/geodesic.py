@@ -1,11 +1,12 @@
 """Exact geodesic distance fields over the free cells of all layers of a tile (paper, Sec. III-D).
 
-The distance is the length of the shortest path of a point through the union of the free cells of a tile, seen from
-above, passing between layers through the connector cells that they share. Such a path is a polyline that bends at
-convex corners of occupied cells only. A wavefront therefore expands sources in order of their distance, first the
-goal and then the corners that it reaches: each lights the cells that it sees within the wedge into which a shortest
-path can bend there, row by row as in Anya (Harabor et al., "Optimal any-angle pathfinding in practice", JAIR
-2016). Visibility is decided in integers, so there is no lattice error; what is left is the rounding to `UNIT`.
+The distance is the length of the shortest path of a point through the union of the free cells of a tile, seen
+from above, passing between layers through the connector cells that they share. Such a path is a polyline that
+bends at convex corners of occupied cells only. A wavefront therefore expands sources in order of their distance,
+first the goal and then the corners that it reaches: each lights the cells that it sees within the wedge into
+which a shortest path can bend there, row by row as in Anya (Harabor et al., "Optimal any-angle pathfinding in
+practice", JAIR 2016). Visibility is decided in integers, so there is no lattice error; what is left is the
+rounding to `UNIT`.
 """
 
 from __future__ import annotations
@@ -13,18 +14,26 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from romnav.world.grids import Grids
+
+if TYPE_CHECKING:
+    from romnav.world.world import World
 
 UNIT: float = 1 / 256
 """Metres per count of a field."""
 UNREACHABLE: int = 65535
 """Count of a node that cannot be reached, or is farther than 255 m."""
+GOAL: int = 65535
+"""Source of a node that sees the goal."""
 
 EAST, WEST, UP, DOWN = range(4)
 STEPS = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])
@@ -36,7 +45,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Surface:
-    """Nodes of all tiles; corner ``k`` of a cell lies towards ``(2 * (k & 1) - 1, (k & 2) - 1)`` in (iy, ix)."""
+    """Nodes of all tiles; corner k of a cell lies towards ``(2 * (k & 1) - 1, (k & 2) - 1)`` in (iy, ix)."""
 
     xy: wp.array2d[wp.int32]
     """(M, 2) centre of each node, (iy, ix) in half cells."""
@@ -54,7 +63,7 @@ class Surface:
 
 @wp.struct
 class Cone:
-    """What the current source sees through the lower border of a row: directions from ``l`` (left) to ``r``."""
+    """What a source sees through the lower border of a row: directions from ``l`` (left) to ``r`` (right)."""
 
     node: int
     """Node of the row, at the left end."""
@@ -68,8 +77,10 @@ class Cone:
 
 @wp.struct
 class Frontier:
-    """Working memory of each worker: a heap of corners by distance, and the cones of the current source."""
+    """Working memory of each worker: nodes lit, a heap of corners by distance, cones of the current source."""
 
+    lit: wp.array2d[wp.float32]
+    """Distance of each node of the tile from the goal, m."""
     distance: wp.array2d[wp.float32]
     heading: wp.array2d[wp.vec2i]
     slot: wp.array2d[wp.int32]
@@ -138,15 +149,17 @@ def length(s: Surface, x: int, y: int):
 def expand(
     s: Surface,
     f: Frontier,
-    field: wp.array[wp.uint16],
+    sources: wp.array[wp.uint16],
     base: wp.int64,
     w: int,
+    first_node: int,
+    source: wp.uint16,
     x: int,
     start: float,
     up: int,
     cone: Cone,
 ):
-    """Light the cells within ``cone`` of a source at column ``x``, ``start`` m from the goal, rows towards ``up``."""
+    """Light the cells in a cone of a source at column ``x``, ``start`` metres from the goal; rows go ``up``."""
     sign = 5 - 2 * up
     over = 2 * (3 - up)
     under = 2 - over
@@ -176,9 +189,10 @@ def expand(
             if left * c.ry >= c.rx * top and centre * c.ry > c.rx * middle:
                 break
             if centre * c.ly >= c.lx * middle and centre * c.ry <= c.rx * middle:
-                count = wp.min(int((start + length(s, centre, middle)) * 256.0 + 0.5), 65535)
-                if count < int(field[base + wp.int64(n)]):
-                    field[base + wp.int64(n)] = wp.uint16(count)
+                distance = start + length(s, centre, middle)
+                if distance < f.lit[w, n - first_node]:
+                    f.lit[w, n - first_node] = distance
+                    sources[base + wp.int64(n - first_node)] = source
             east = s.link[n, 0]
             above = s.link[n, up]
             if above >= 0 and right * c.ly > c.lx * top and left * c.ry < c.rx * top:
@@ -195,29 +209,19 @@ def expand(
                             relax(
                                 f, w, s.corner[above, under], start + length(s, left, top), left, sign * top
                             )
-                joined = int(0)
+                next = int(-1)
                 if east >= 0 and right * c.ry < c.rx * top:
-                    if s.link[above, 0] >= 0 and s.link[above, 0] == s.link[east, up]:
-                        joined = 1
-                if joined == 0:
+                    next = s.link[east, up]
+                if next < 0 or next != s.link[above, 0]:
                     rx = c.rx
                     ry = c.ry
                     if right * c.ry <= c.rx * top:
                         rx = right
                         ry = top
+                        corner = s.corner[above, under + 1]
                         if right < 0:
-                            relax(
-                                f, w, s.corner[n, over + 1], start + length(s, right, top), right, sign * top
-                            )
-                        else:
-                            relax(
-                                f,
-                                w,
-                                s.corner[above, under + 1],
-                                start + length(s, right, top),
-                                right,
-                                sign * top,
-                            )
+                            corner = s.corner[n, over + 1]
+                        relax(f, w, corner, start + length(s, right, top), right, sign * top)
                     if lx * ry < rx * ly:
                         f.cones[w, tail % room] = Cone(first, top, lx, ly, rx, ry)
                         tail += 1
@@ -243,25 +247,36 @@ def wavefront(
     s: Surface,
     f: Frontier,
     goals: wp.array[wp.int32],
-    corners: wp.array2d[wp.int32],
-    bases: wp.array[wp.int64],
+    tiles: wp.array[wp.int32],
+    nodes: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    fields: wp.array[wp.int64],
+    reaches: wp.array[wp.int64],
     first: int,
     workers: int,
     field: wp.array[wp.uint16],
+    sources: wp.array[wp.uint16],
+    reach: wp.array[wp.float32],
 ):
-    """Fields of the goals ``first + tid``, ``first + tid + workers``, ...; ``corners``: (G, 2) range of each tile."""
+    """Goals ``first + tid``, ``first + tid + workers``, ... of ``tiles``, with the offsets of tiles and goals."""
     w = first + wp.tid()
     for g in range(w, goals.shape[0], workers):
-        base = bases[g]
-        offset = corners[g, 0]
-        for k in range(corners[g, 1] - offset):
+        tile = tiles[g]
+        node_start = nodes[tile]
+        node_count = nodes[tile + 1] - node_start
+        offset = corners[tile]
+        corner_count = corners[tile + 1] - offset
+        base = fields[g]
+        for n in range(node_count):
+            f.lit[w, n] = wp.inf
+        for k in range(corner_count):
             f.distance[w, k] = wp.inf
             f.slot[w, k] = -1
         f.size[w] = 0
         goal = goals[g]
         x = s.xy[goal, 0]
-        expand(s, f, field, base, w, x, 0.0, 2, Cone(goal, -1, -1, 0, 1, 0))
-        expand(s, f, field, base, w, x, 0.0, 3, Cone(goal, -1, -1, 0, 1, 0))
+        expand(s, f, sources, base, w, node_start, wp.uint16(65535), x, 0.0, 2, Cone(goal, -1, -1, 0, 1, 0))
+        expand(s, f, sources, base, w, node_start, wp.uint16(65535), x, 0.0, 3, Cone(goal, -1, -1, 0, 1, 0))
         while f.size[w] > 0:
             k = nearest(f, w)
             node = s.corner_node[offset + k]
@@ -294,71 +309,115 @@ def wavefront(
                 rx = dx
                 ry = wp.abs(dy)
             cone = Cone(begin, 0, lx, ly, rx, ry)
-            expand(s, f, field, base, w, s.xy[node, 0] + ox, start, up, cone)
+            expand(s, f, sources, base, w, node_start, wp.uint16(k), s.xy[node, 0] + ox, start, up, cone)
             under = 2 * (up - 2)
             if ry == 0:
                 follow(s, f, w, begin, start, 0, under)
             if ly == 0:
                 follow(s, f, w, begin, start, 1, under + 1)
+        for n in range(node_count):
+            field[base + wp.int64(n)] = wp.uint16(int(wp.min(f.lit[w, n] * 256.0 + 0.5, 65535.0)))
+        for k in range(corner_count):
+            reach[reaches[g] + wp.int64(k)] = f.distance[w, k]
+
+
+@dataclass(frozen=True)
+class Geodesics:
+    """Shortest paths from every node of a tile to its ``G`` goals, through ``C`` corners."""
+
+    distance: NDArray[np.uint16]
+    """(G, M) planar length of the path, in `UNIT`; 65535 where there is none or it is longer than 255 m."""
+    source: NDArray[np.uint16]
+    """(G, M) corner at which the path first bends, `GOAL` where it leads straight to the goal."""
+    reach: NDArray[np.float32]
+    """(G, C) planar distance of each corner to the goal, m; infinite where no shortest path bends."""
+    corner: NDArray[np.float32]
+    """(C, 2) position of each corner, m."""
 
 
 def fields(grids: Grids, goals: NDArray[np.integer]) -> NDArray[np.uint16]:
     """Planar shortest distance from every node to each goal node, (G, M), in `UNIT`."""
-    return fields_many([grids], [goals])[0]
+    return solve([grids], [goals])[0].distance
 
 
-def fields_many(
-    tiles: Sequence[Grids], goals: Sequence[NDArray[np.integer]], device: str = "cpu"
-) -> list[NDArray[np.uint16]]:
-    """`fields` of many tiles at once, on all cores or on a CUDA device; one (G, M) array per tile."""
-    parts = [_surface(g) for g in tiles]
-    node_offset = np.cumsum([0] + [len(p["xy"]) for p in parts])
-    corner_offset = np.cumsum([0] + [len(p["corner_node"]) for p in parts])
-    for p, n in zip(parts, node_offset, strict=False):
-        p["link"][p["link"] >= 0] += n
-        p["corner_node"] += n
-    packed = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
-    tile = np.repeat(np.arange(len(tiles)), [len(g) for g in goals])
-    sizes = np.diff(node_offset)[tile]
-    offset = np.concatenate([[0], np.cumsum(sizes)])
-    start = np.concatenate([np.asarray(g) + n for g, n in zip(goals, node_offset, strict=False)])
+def fields_many(tiles: Sequence[Grids], goals: Sequence[NDArray[np.integer]]) -> list[NDArray[np.uint16]]:
+    """`fields` of many tiles at once, on all cores."""
+    return [g.distance for g in solve(tiles, goals)]
 
-    workers = len(os.sched_getaffinity(0)) if device == "cpu" else len(start)
+
+def solve(
+    tiles: Sequence[Grids], goals: Sequence[NDArray[np.integer]], device: str = "cpu", workers: int = 0
+) -> list[Geodesics]:
+    """Shortest paths to the goal nodes of each tile, one worker per core (or per goal on CUDA) unless told."""
+    surfaces = [_surface(g) for g in tiles]
+    nodes = np.cumsum([0] + [len(p["xy"]) for p in surfaces])
+    corners = np.cumsum([0] + [len(p["corner_node"]) for p in surfaces])
+    positions = [_corner_positions(p, g.cell) for p, g in zip(surfaces, tiles, strict=True)]
+    counts = [len(g) for g in goals]
+    tile = np.repeat(np.arange(len(tiles)), counts)
+    field_offset = np.cumsum(np.concatenate([[0], np.diff(nodes)[tile]]))
+    reach_offset = np.cumsum(np.concatenate([[0], np.diff(corners)[tile]]))
+    workers = workers or (len(os.sched_getaffinity(0)) if device == "cpu" else len(tile))
+
     s = Surface()
-    for key, value in packed.items():
-        setattr(s, key, wp.array(value, dtype=wp.int32, device=device))
     s.half = tiles[0].cell / 2
+    for key, value in _pack(surfaces, nodes).items():
+        setattr(s, key, wp.array(value, dtype=wp.int32, device=device))
+    shape = workers, int(np.diff(corners).max()) + 1
     f = Frontier()
-    shape = workers, int(np.diff(corner_offset).max()) + 1
+    f.lit = wp.empty((workers, int(np.diff(nodes).max())), dtype=wp.float32, device=device)
     f.distance = wp.empty(shape, dtype=wp.float32, device=device)
     f.heading = wp.empty(shape, dtype=wp.vec2i, device=device)
     f.slot = wp.empty(shape, dtype=wp.int32, device=device)
     f.heap = wp.empty(shape, dtype=wp.int32, device=device)
     f.size = wp.empty(workers, dtype=wp.int32, device=device)
+    # the cones of a row are apart by the width of an occupied cell at least
     f.cones = wp.empty((workers, max(g.node.shape[2] for g in tiles) + 4), dtype=Cone, device=device)
-    out = wp.full(int(offset[-1]), UNREACHABLE, dtype=wp.uint16, device=device)
-    inputs = [
-        s,
-        f,
-        wp.array(start, dtype=wp.int32, device=device),
-        wp.array(
-            np.stack([corner_offset[tile], corner_offset[tile + 1]], axis=1), dtype=wp.int32, device=device
-        ),
-        wp.array(offset[:-1] - node_offset[tile], dtype=wp.int64, device=device),
-    ]
+    field = wp.empty(int(field_offset[-1]), dtype=wp.uint16, device=device)
+    source = wp.empty(int(field_offset[-1]), dtype=wp.uint16, device=device)
+    reach = wp.empty(int(reach_offset[-1]), dtype=wp.float32, device=device)
+    start = np.concatenate([np.asarray(g) + n for g, n in zip(goals, nodes, strict=False)])
+    inputs = [s, f, *(wp.array(a, dtype=wp.int32, device=device) for a in (start, tile, nodes, corners))]
+    inputs += [wp.array(a, dtype=wp.int64, device=device) for a in (field_offset[:-1], reach_offset[:-1])]
+
+    def run(first: int, count: int) -> None:
+        wp.launch(wavefront, count, [*inputs, first, workers, field, source, reach], device=device)
+
     if device == "cpu":
-        wp.load_module(device="cpu")
+        wp.load_module(device=device)
         with ThreadPoolExecutor(workers) as pool:
-            list(
-                pool.map(
-                    lambda w: wp.launch(wavefront, 1, [*inputs, w, workers, out], device="cpu"),
-                    range(workers),
-                )
-            )
+            list(pool.map(run, range(workers), [1] * workers))
     else:
-        wp.launch(wavefront, workers, [*inputs, 0, workers, out], device=device)
-    ends = offset[np.cumsum([len(g) for g in goals])]
-    return [f.reshape(len(g), -1) for f, g in zip(np.split(out.numpy(), ends[:-1]), goals, strict=True)]
+        run(0, workers)
+    ends = np.cumsum(counts)[:-1]
+    return [
+        Geodesics(*(part.reshape(count, -1) for part in parts), corner)
+        for count, corner, *parts in zip(
+            counts,
+            positions,
+            np.split(field.numpy(), field_offset[ends]),
+            np.split(source.numpy(), field_offset[ends]),
+            np.split(reach.numpy(), reach_offset[ends]),
+            strict=True,
+        )
+    ]
+
+
+def _pack(
+    surfaces: Sequence[dict[str, NDArray[np.int32]]], nodes: NDArray[np.intp]
+) -> dict[str, NDArray[np.int32]]:
+    """Arrays of `Surface` with the nodes of all tiles numbered through."""
+    shifted = [
+        {**p, "link": np.where(p["link"] >= 0, p["link"] + n, -1), "corner_node": p["corner_node"] + n}
+        for p, n in zip(surfaces, nodes, strict=False)
+    ]
+    return {key: np.concatenate([p[key] for p in shifted]) for key in surfaces[0]}
+
+
+def _corner_positions(surface: dict[str, NDArray[np.int32]], cell: float) -> NDArray[np.float32]:
+    side = surface["corner_side"]
+    yx = surface["xy"][surface["corner_node"]] + np.stack([2 * (side & 1) - 1, (side & 2) - 1], axis=1)
+    return (yx[:, ::-1] * (cell / 2)).astype(np.float32)
 
 
 def _surface(grids: Grids) -> dict[str, NDArray[np.int32]]:
@@ -383,3 +442,142 @@ def _surface(grids: Grids) -> dict[str, NDArray[np.int32]]:
         "corner_node": node.astype(np.int32),
         "corner_side": side.astype(np.int32),
     }
+
+
+@wp.struct
+class Paths:
+    """`Geodesics` of all tiles, end to end, with the offsets of each goal."""
+
+    source: wp.array[wp.uint16]
+    source_offset: wp.array[wp.int64]
+    reach: wp.array[wp.float32]
+    reach_offset: wp.array[wp.int64]
+    corner: wp.array[wp.vec2]
+    corner_offset: wp.array[wp.int64]
+    goal: wp.array[wp.vec2]
+
+
+@wp.func
+def bend(paths: Paths, goal: wp.int64, node: wp.int64):
+    """First bend of the path from ``node`` (x, y), and its distance from the goal, m."""
+    source = wp.int64(paths.source[paths.source_offset[goal] + node])
+    if source == wp.int64(65535):
+        return wp.vec3(paths.goal[goal][0], paths.goal[goal][1], 0.0)
+    corner = paths.corner[paths.corner_offset[goal] + source]
+    return wp.vec3(corner[0], corner[1], paths.reach[paths.reach_offset[goal] + source])
+
+
+@wp.kernel
+def look(
+    s: Surface,
+    paths: Paths,
+    at: wp.array[wp.int64],
+    position: wp.array[wp.vec2],
+    goals: wp.array[wp.int64],
+    distance: wp.array[wp.float32],
+    direction: wp.array[wp.vec2],
+):
+    e = wp.tid()
+    node = at[e]
+    if node < wp.int64(0):
+        distance[e] = wp.inf
+        direction[e] = wp.vec2(0.0, 0.0)
+        return
+    p = position[e]
+    g = goals[e]
+    offset = p - s.half * wp.vec2(float(s.xy[node, 1]), float(s.xy[node, 0]))
+    along = 2
+    if offset[0] < 0.0:
+        along = 3
+    across = 0
+    if offset[1] < 0.0:
+        across = 1
+    a = s.link[node, along]
+    b = s.link[node, across]
+    diagonal = int(-1)
+    if a >= 0:
+        diagonal = s.link[a, across]
+    if diagonal < 0 and b >= 0:
+        diagonal = s.link[b, along]
+    u = wp.min(wp.abs(offset[0]) / (2.0 * s.half), 0.5)
+    v = wp.min(wp.abs(offset[1]) / (2.0 * s.half), 0.5)
+    total = float(0.0)
+    weights = float(0.0)
+    for k in range(4):
+        n = node
+        weight = (1.0 - u) * (1.0 - v)
+        if k == 1:
+            n = wp.int64(a)
+            weight = u * (1.0 - v)
+        if k == 2:
+            n = wp.int64(b)
+            weight = (1.0 - u) * v
+        if k == 3:
+            n = wp.int64(diagonal)
+            weight = u * v
+        if n >= wp.int64(0):
+            end = bend(paths, g, n)
+            total += weight * (end[2] + wp.length(p - wp.vec2(end[0], end[1])))
+            weights += weight
+    distance[e] = total / weights
+    end = bend(paths, g, node)
+    direction[e] = wp.normalize(wp.vec2(end[0], end[1]) - p)
+
+
+class GeodesicLookup:
+    """Distance and direction to the goals of a world at any position, not at nodes alone.
+
+    The distance blends, bilinearly, what the paths of the surrounding nodes give when they start at the position
+    itself: it is exact where those nodes see the same corner, and continuous everywhere.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        nodes, goals = world.node_start, world.goal_start
+        tile = torch.repeat_interleave(torch.arange(len(world.grids)), goals.diff().cpu())
+        local = (world.goal - nodes[tile]).cpu().numpy()
+        solved = solve(world.grids, np.split(local, goals[1:-1].cpu().numpy()))
+        surfaces = [_surface(g) for g in world.grids]
+        device = str(world.node.device)
+        self._surface = Surface()
+        self._surface.half = world.cell / 2
+        for key, value in _pack(surfaces, nodes.cpu().numpy()).items():
+            setattr(self._surface, key, wp.array(value, dtype=wp.int32, device=device))
+        corners = np.cumsum([0] + [len(p.corner) for p in solved])
+        count = np.diff(corners)[tile]
+        self._paths = Paths()
+        for key, value, kind in (
+            ("source", np.concatenate([p.source.ravel() for p in solved]), wp.uint16),
+            ("source_offset", (world.field_start - nodes[tile]).cpu().numpy(), wp.int64),
+            ("reach", np.concatenate([p.reach.ravel() for p in solved]), wp.float32),
+            ("reach_offset", np.cumsum(count) - count, wp.int64),
+            ("corner", np.concatenate([p.corner for p in solved]), wp.vec2),
+            ("corner_offset", corners[tile], wp.int64),
+            ("goal", world.position[world.goal, :2].cpu().numpy(), wp.vec2),
+        ):
+            setattr(self._paths, key, wp.array(value, dtype=kind, device=device))
+
+    def __call__(self, tile: Tensor, layer: Tensor, xy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Planar distance (E,), m, and unit direction (E, 2) of the shortest path to goals (E,).
+
+        Robots are at ``xy`` (E, 2), m, on a layer of a tile (E,). Off the free cells the distance is infinite and
+        the direction zero.
+        """
+        node = self._world.node_at(tile, layer, xy)
+        distance = torch.empty(len(xy), device=xy.device)
+        direction = torch.empty(len(xy), 2, device=xy.device)
+        wp.launch(
+            look,
+            len(xy),
+            [
+                self._surface,
+                self._paths,
+                wp.from_torch(node),
+                wp.from_torch(xy.contiguous(), dtype=wp.vec2),
+                wp.from_torch(goal),
+                wp.from_torch(distance),
+                wp.from_torch(direction, dtype=wp.vec2),
+            ],
+            device=str(xy.device),
+        )
+        return distance, direction
