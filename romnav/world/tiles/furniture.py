@@ -176,7 +176,7 @@ def _tree(
     b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
 ) -> None:
     fork = float(rng.uniform(1.9, 2.6))
-    crown = float(rng.uniform(0.8, 1.5))
+    crown = float(rng.uniform(0.7, 1.15))
     b.cylinder((f.x, f.y), float(rng.uniform(0.08, 0.18)), (z, z + fork))
     b.cylinder((f.x, f.y), 0.75 * crown, (z + fork, z + fork + 0.5))
     b.cylinder((f.x, f.y), crown, (z + fork + 0.5, z + fork + 1.4))
@@ -207,6 +207,41 @@ def _sign(
     block(b, f, (-length / 2, length / 2), (0.03, 0.06), (low, low + 0.6))
 
 
+def _car(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
+    u, v = length / 2, width / 2
+    block(b, f, (-u, u), (-v, v), (z + 0.2, z + 0.85))
+    block(b, f, (-0.55 * u, 0.65 * u), (-v + 0.1, v - 0.1), (z + 0.85, z + 1.45))
+    for su in (-0.62, 0.62):
+        for sv in (-1, 1):
+            block(
+                b, f, (su * u - 0.3, su * u + 0.3), (sv * (v - 0.1) - 0.1, sv * (v - 0.1) + 0.1), (z, z + 0.2)
+            )
+
+
+def _barrier(
+    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
+) -> None:
+    for s in (-1, 1):
+        block(
+            b,
+            f,
+            (s * (length / 2 - 0.1) - 0.03, s * (length / 2 - 0.1) + 0.03),
+            (-width / 2, width / 2),
+            (z, z + 0.6),
+        )
+    block(b, f, (-length / 2, length / 2), (-0.02, 0.02), (z + 0.6, z + 0.9))
+
+
+def _portal(
+    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
+) -> None:
+    head = z + float(rng.uniform(1.45, 1.9))
+    for s in (-1, 1):
+        at = s * (length / 2 - 0.075)
+        block(b, f, (at - 0.075, at + 0.075), (-width / 2, width / 2), (z, head))
+    block(b, f, (-length / 2, length / 2), (-width / 2, width / 2), (head, head + 0.2))
+
+
 ROOM = (
     Item(_desk, (1.2, 1.8), (1.3, 1.4), True),
     Item(_dining, (1.6, 2.6), (1.8, 2.1), False),
@@ -218,6 +253,13 @@ ROOM = (
     Item(_crate, (0.4, 0.9), (0.4, 0.9), False),
     Item(_hanging, (0.3, 1.2), (0.1, 0.5), False),
     Item(_pole, (0.3, 0.3), (0.3, 0.3), False),
+)
+CLUTTER = (
+    *ROOM,
+    Item(_pillar, (0.3, 0.5), (0.3, 0.5), False),
+    Item(_portal, (1.6, 2.4), (0.15, 0.4), False),
+    Item(_bench, (1.2, 1.8), (0.4, 0.5), True),
+    Item(_barrier, (1.0, 1.8), (0.3, 0.5), False),
 )
 HALL = (
     Item(_sofa, (1.5, 2.3), (0.8, 0.95), True),
@@ -236,6 +278,11 @@ STREET = (
     Item(_lamp, (0.25, 0.25), (0.25, 0.25), False),
     Item(_sign, (0.8, 1.4), (0.1, 0.1), False),
     Item(_crate, (0.4, 1.0), (0.4, 1.0), False),
+)
+ROAD = (
+    Item(_car, (3.8, 4.6), (1.7, 1.9), False),
+    Item(_barrier, (1.0, 1.8), (0.3, 0.5), False),
+    Item(_bollard, (0.2, 0.2), (0.2, 0.2), False),
 )
 
 

@@ -1,191 +1,274 @@
-"""Outdoor terrain: terraces at several heights joined by steps and ramps, and street furniture."""
+"""Outdoor terrain: terraces, streets and parks at several heights, joined by steps and ramps."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Connector, Tile, TileClass
-from romnav.world.tiles.furniture import STREET, furnish
-from romnav.world.tiles.site import Floor, Frame, Span, block
-from romnav.world.tiles.stairs import MOUTH, Flight, Railing, add_flight, add_railing, draw_ramp, draw_stair
+from romnav.world.tiles.furniture import ROAD, STREET, Item, furnish
+from romnav.world.tiles.site import Floor, Frame, Span, block, cut, edges
+from romnav.world.tiles.stairs import MOUTH, Railing, add_flight, add_railing, draw_ramp, draw_stair
 
 EDGE = 0.3
-"""Width of the boundary wall or hedge, m."""
+"""Depth of the boundary wall, hedge or fence, m."""
 CURB = (0.08, 0.15)
+"""Heights that are stepped over, m."""
 
 
 @dataclass
 class Plot:
-    """A level rectangle of terrain."""
+    """A level rectangle of terrain, in the tile frame; ``notches`` are cut out of it for inset stairs."""
 
     u: Span
     v: Span
-    z: float
+    z: float = 0.0
+    items: tuple[Item, ...] = STREET
+    notches: list[tuple[Span, Span]] = field(default_factory=list)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Extents, m."""
+        return self.u[1] - self.u[0], self.v[1] - self.v[0]
+
+    @property
+    def frame(self) -> Frame:
+        """Frame at its corner."""
+        return Frame(self.u[0], self.v[0])
 
 
-def outdoor(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
-    """Terraces: the tile is divided into plots of different heights; a spanning tree of connectors joins them."""
-    solids = SolidsBuilder()
-    frame = Frame(0.0, 0.0)
-    plots = _divide(rng, (0.0, spec.side), (0.0, spec.side))
-    order = [int(k) for k in rng.permutation(len(plots))]
-    for k in order:
-        plots[k].z = float(rng.choice([0.0, 0.0, rng.uniform(0.3, 0.8), rng.uniform(0.8, 2.5)]))
-    floor = Floor(spec.side)
-    inner = (EDGE, spec.side - EDGE)
-    floor.open(frame, inner, inner)
-    connectors = _join(solids, rng, spec, plots, floor, Railing.draw(rng))
+def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
+    """A fenced piece of terrain in one of three layouts, with street furniture."""
+    layout: Callable[[np.random.Generator, float], list[Plot]] = (_terraces, _street, _park)[
+        int(rng.integers(3))
+    ]
+    plots = layout(rng, spec.side)
+    site = _Site(rng, spec)
+    site.join(plots)
     for plot in plots:
-        block(solids, frame, plot.u, plot.v, (-0.2, plot.z), label=Label.GROUND, layers=(0, 0))
-        size = (plot.u[1] - plot.u[0], plot.v[1] - plot.v[0])
-        count = int(rng.poisson(size[0] * size[1] / 14.0))
-        furnish(
-            solids,
-            rng,
-            floor,
-            frame.sub(plot.u[0], plot.v[0]),
-            size,
-            plot.z,
-            STREET,
-            count,
-            gap=0.9,
-            turn=0.8,
-        )
-    high = max(plot.z for plot in plots)
-    _boundary(solids, rng, spec.side, high)
+        for u, v in cut((plot.u, plot.v), plot.notches):
+            block(site.solids, Frame(0.0, 0.0), u, v, (-0.2, plot.z), label=Label.GROUND, layers=(0, 0))
+        if min(plot.size) > 7.0:
+            site.podiums(plot)
+    site.border(plots)
+    for plot in plots:
+        count = int(rng.poisson(plot.size[0] * plot.size[1] / 11.0))
+        furnish(site.solids, rng, site.floor, plot.frame, plot.size, plot.z, plot.items, count, turn=0.8)
     return Tile(
         kind=TileClass.OUTDOOR,
-        seed=seed,
+        seed=index,
         side=spec.side,
-        solids=solids.build(),
+        solids=site.solids.build(),
         layers=(0.0,),
         storeys=(0,),
-        connectors=tuple(connectors),
+        connectors=tuple(site.connectors),
     )
 
 
+def _terraces(rng: np.random.Generator, side: float) -> list[Plot]:
+    """Plots of a recursive bisection at heights that differ by a climb or by a curb."""
+    climbs = np.cumsum([0.0, rng.uniform(0.5, 0.9), rng.uniform(0.5, 0.9), rng.uniform(0.5, 0.9)])
+    plots = _divide(rng, (0.0, side), (0.0, side))
+    for plot in plots:
+        plot.z = float(climbs[rng.choice(4, p=(0.4, 0.25, 0.2, 0.15))])
+        if rng.random() < 0.25:
+            plot.z += float(rng.uniform(*CURB))
+    return plots
+
+
 def _divide(rng: np.random.Generator, u: Span, v: Span) -> list[Plot]:
-    """Recursive bisection into plots of at least 5 m."""
     du, dv = u[1] - u[0], v[1] - v[0]
     if max(du, dv) < 10.5 or (max(du, dv) < 14.0 and rng.random() < 0.3):
-        return [Plot(u, v, 0.0)]
+        return [Plot(u, v)]
     at = float(rng.uniform(0.35, 0.65))
-    if du >= dv:
+    if du > dv or (du == dv and rng.random() < 0.5):
         middle = u[0] + at * du
         return _divide(rng, (u[0], middle), v) + _divide(rng, (middle, u[1]), v)
     middle = v[0] + at * dv
     return _divide(rng, u, (v[0], middle)) + _divide(rng, u, (middle, v[1]))
 
 
-def _shared(a: Plot, b: Plot) -> tuple[Frame, float] | None:
-    """Shared edge of two plots: frame at its start with u along it and v towards ``b``, and its length."""
-    for edge, other, side in ((a.u, b.u, 0), (a.v, b.v, 1)):
-        cross_a, cross_b = (a.v, b.v) if side == 0 else (a.u, b.u)
-        low, high = max(cross_a[0], cross_b[0]), min(cross_a[1], cross_b[1])
-        if high - low < 2.5:
-            continue
-        if abs(edge[1] - other[0]) < 1e-9:
-            return (Frame(edge[1], high, -np.pi / 2) if side == 0 else Frame(low, edge[1])), high - low
-        if abs(edge[0] - other[1]) < 1e-9:
-            return (Frame(edge[0], low, np.pi / 2) if side == 0 else Frame(high, edge[0], np.pi)), high - low
-    return None
+def _street(rng: np.random.Generator, side: float) -> list[Plot]:
+    """A road between kerbed pavements, with raised gardens behind them."""
+    road, walks = float(rng.uniform(4.5, 6.5)), rng.uniform(2.2, 3.4, 2)
+    spare = side - road - float(walks.sum())
+    first = float(rng.uniform(0.35, 0.65)) * spare
+    cuts = np.cumsum([0.0, first, walks[0], road, walks[1]])
+    lines = [*(float(c) for c in cuts), side]
+    curb = float(rng.uniform(*CURB))
+    turned = rng.random() < 0.5
+    plots = []
+
+    def add(along: Span, across: Span, z: float, items: tuple[Item, ...]) -> None:
+        plots.append(Plot(across, along, z, items) if turned else Plot(along, across, z, items))
+
+    for k, z in ((1, curb), (2, 0.0), (3, curb)):
+        add((0.0, side), (lines[k], lines[k + 1]), z, ROAD if k == 2 else STREET)
+    for k in (0, 4):
+        count = int(rng.integers(1, 4))
+        ends = np.linspace(0.0, side, count + 1)
+        for a, b in zip(ends[:-1], ends[1:], strict=True):
+            z = curb + float(rng.choice([0.0, rng.uniform(0.4, 1.0), rng.uniform(1.0, 2.3)]))
+            add((float(a), float(b)), (lines[k], lines[k + 1]), z, STREET)
+    return plots
 
 
-def _join(
-    solids: SolidsBuilder,
-    rng: np.random.Generator,
-    spec: WorldSpec,
-    plots: list[Plot],
-    floor: Floor,
-    railing: Railing,
-) -> list[Connector]:
-    connectors = []
-    joined = list(range(len(plots)))
-    pairs = [(a, b) for a in range(len(plots)) for b in range(a) if _shared(plots[a], plots[b])]
-    for k in rng.permutation(len(pairs)):
-        a, b = pairs[int(k)]
-        low, high = (a, b) if plots[a].z <= plots[b].z else (b, a)
-        rise = plots[high].z - plots[low].z
-        shared = _shared(plots[high], plots[low])
-        if shared is None or rise < 0.25:
-            joined = [joined[low] if j == joined[high] else j for j in joined]
-            continue
-        frame, length = shared
-        built: list[Span] = []
-        if joined[a] != joined[b] or rng.random() < 0.6:
-            connector = _connect(solids, rng, spec, floor, frame, length, plots[low].z, rise, railing, built)
-            if connector is not None:
-                connectors.append(connector)
-                joined = [joined[low] if j == joined[high] else j for j in joined]
-        if rng.random() < 0.6:
+def _park(rng: np.random.Generator, side: float) -> list[Plot]:
+    """One meadow, or two with a step of terrain between; podiums make the rest."""
+    if rng.random() < 0.6:
+        return [Plot((0.0, side), (0.0, side))]
+    middle = side * float(rng.uniform(0.35, 0.65))
+    return [Plot((0.0, side), (0.0, middle)), Plot((0.0, side), (middle, side), float(rng.uniform(0.4, 1.8)))]
+
+
+class _Site:
+    """The solids, reservations and connectors of one outdoor tile under construction."""
+
+    def __init__(self, rng: np.random.Generator, spec: WorldSpec) -> None:
+        self.rng, self.spec = rng, spec
+        self.solids = SolidsBuilder()
+        self.connectors: list[Connector] = []
+        self.railing = Railing.draw(rng)
+        self.floor = Floor(spec.side)
+        self.floor.open(Frame(0.0, 0.0), (EDGE, spec.side - EDGE), (EDGE, spec.side - EDGE))
+
+    def join(self, plots: list[Plot]) -> None:
+        """Join neighbouring plots by flights along their shared edges: all that need one, and more."""
+        group = list(range(len(plots)))
+        pairs = [(a, b) for a in range(len(plots)) for b in range(a) if _shared(plots[a], plots[b])]
+        for k in self.rng.permutation(len(pairs)):
+            low, high = sorted(pairs[int(k)], key=lambda i: plots[i].z)
+            rise = plots[high].z - plots[low].z
+            shared = _shared(plots[high], plots[low])
+            assert shared is not None
+            if rise <= CURB[1]:
+                joined = True
+            else:
+                wanted = 1 + int(self.rng.poisson(shared[1] / 14.0)) if group[low] != group[high] else 1
+                joined = self.climb(*shared, plots[low].z, rise, wanted, plots[high]) > 0
+            if joined:
+                group = [group[low] if g == group[high] else g for g in group]
+
+    def climb(
+        self, frame: Frame, length: float, z: float, rise: float, wanted: int, upper: Plot | None = None
+    ) -> int:
+        """Build up to ``wanted`` flights over the edge along u (lower ground at v > 0), and perhaps a railing.
+
+        Flights stand before the edge, or in a notch of the ``upper`` plot. Returns how many were built.
+        """
+        rng, built = self.rng, []
+        for _ in range(8 * wanted):
+            if len(built) == wanted:
+                break
+            widest = length - 0.9
+            width = float(rng.choice([rng.uniform(1.4, 2.2), rng.uniform(2.2, 4.0), rng.uniform(4.0, 8.0)]))
+            if min(width, widest) < 1.4:
+                break
+            width = min(width, widest)
+            flight = (
+                draw_ramp(rng, rise, width, (7.0, 15.0))
+                if rng.random() < 0.45
+                else draw_stair(rng, self.spec, rise, width)
+            )
+            inset = upper is not None and rng.random() < 0.35
+            at = float(rng.uniform(0.4, length - width - 0.4)) + width / 2
+            foot = frame.sub(at, 0.0 if inset else flight.length, -np.pi / 2)
+            v = (-width / 2, width / 2)
+            if not self.floor.fits(foot, (-1.3, flight.length + 1.3), (v[0] - 0.15, v[1] + 0.15)):
+                continue
+            add_flight(self.solids, foot, z, flight, (0, 0), base=z - 0.1)
+            built.append((at - width / 2, at + width / 2))
+            points = [(-MOUTH, 0.0, z), (0.0, 0.0, z), (flight.length, 0.0, z + rise)]
+            points.append((flight.length + MOUTH, 0.0, z + rise))
+            self.connectors.append(Connector(flight.kind, foot.path(points), width, (0, 0)))
+            guarded = rise > 0.5 and rng.random() < 0.6
+            if inset and upper is not None:
+                corners = [foot.at(u, w) for u in (0.0, flight.length) for w in v]
+                xs, ys = zip(*corners, strict=True)
+                upper.notches.append(((min(xs), max(xs)), (min(ys), max(ys))))
+            for side in (-1, 1) if guarded else ():
+                if inset:
+                    rail = foot.sub(0.0, side * (width / 2 + 0.06))
+                    add_railing(self.solids, rail, (0.0, flight.length), z + rise, self.railing)
+                else:
+                    rail = foot.sub(0.0, side * (width / 2 - 0.04))
+                    add_railing(self.solids, rail, (0.0, flight.length), z, self.railing, rise=rise)
+            self.floor.reserve(foot, (-1.4, flight.length + 1.4), v, 0.7)
+        if rng.random() < 0.6 and rise > 0.3:
             edge = 0.0
             for start, end in [*sorted(built), (length, length)]:
                 if start - edge > 0.6:
-                    add_railing(solids, frame.sub(0.0, -0.05), (edge, start), plots[high].z, railing)
+                    add_railing(self.solids, frame.sub(0.0, -0.05), (edge, start), z + rise, self.railing)
                 edge = end
-        floor.reserve(frame, (0.0, length), (-0.7, 0.1))
-    return connectors
+        self.floor.reserve(frame, (0.0, length), (-0.8, 0.4))
+        return len(built)
+
+    def podiums(self, plot: Plot) -> None:
+        """Rotated platforms on a plot: climbed by flights, or islands as high as a curb."""
+        for _ in range(int(self.rng.integers(1, 4))):
+            for _ in range(6):
+                at = plot.frame.sub(*(float(x) for x in self.rng.uniform((0.0, 0.0), plot.size)))
+                yaw = float(self.rng.uniform(0.0, 2 * np.pi))
+                size = (float(self.rng.uniform(2.5, 7.0)), float(self.rng.uniform(2.5, 5.0)))
+                corner = at.sub(0.0, 0.0, yaw).sub(-size[0] / 2, -size[1] / 2)
+                if self.floor.fits(corner, (-1.3, size[0] + 1.3), (-1.3, size[1] + 1.3)):
+                    self.podium(corner, size, plot.z, tier=0)
+                    break
+
+    def podium(self, frame: Frame, size: tuple[float, float], z: float, tier: int) -> None:
+        """A platform at ``frame`` on ground at ``z``, perhaps with another on top of it."""
+        rng = self.rng
+        island = tier == 0 and rng.random() < 0.25
+        rise = float(rng.uniform(*CURB)) if island else float(rng.uniform(0.3, 1.3))
+        ground = ((0.0, size[0]), (0.0, size[1]))
+        block(self.solids, frame, *ground, (z - 0.1, z + rise), label=Label.GROUND, layers=(0, 0))
+        sides = edges(frame, size)
+        for k in rng.permutation(4)[: 0 if island else int(rng.integers(2, 5))]:
+            side, length = sides[int(k)]
+            self.climb(side, length, z, rise, 1)
+        for side, length in sides:
+            self.floor.reserve(side, (0.0, length), (-0.5, 0.5))
+        if not island and tier == 0 and min(size) > 4.6 and rng.random() < 0.7:
+            inner = (size[0] - 3.0, size[1] - 3.0)
+            corner = frame.sub(float(rng.uniform(0.6, 2.4)), float(rng.uniform(0.6, 2.4)))
+            if self.floor.fits(corner, (0.0, inner[0]), (0.0, inner[1])):
+                self.podium(corner, inner, z + rise, tier=1)
+        count = int(rng.poisson(size[0] * size[1] / 9.0))
+        furnish(self.solids, rng, self.floor, frame, size, z + rise, STREET, count, turn=0.5)
+        self.floor.reserve(frame, *ground)
+
+    def border(self, plots: list[Plot]) -> None:
+        """Close the tile: on each side a wall, hedge, fence or house front stands on the plots' own heights."""
+        styles = self.rng.choice(["wall", "hedge", "fence", "front"], 4)
+        heights = self.rng.uniform((1.2, 1.0, 1.1, 3.5), (2.4, 1.6, 1.5, 6.0))
+        fence = Railing(self.railing.spacing, 3, float(heights[2]))
+        side = self.spec.side
+        for plot in plots:
+            for k, (frame, length) in enumerate(edges(plot.frame, plot.size)):
+                x, y = frame.sub(0.0, 1e-3).at(length / 2, 0.0)
+                if 0.0 < x < side and 0.0 < y < side:
+                    continue
+                if styles[k] == "fence":
+                    add_railing(self.solids, frame.sub(0.0, -EDGE / 2), (0.0, length), plot.z, fence)
+                    continue
+                height = float(heights[["wall", "hedge", "fence", "front"].index(styles[k])])
+                block(self.solids, frame, (0.0, length), (-EDGE, 0.0), (plot.z - 0.1, plot.z + height))
 
 
-def _connect(
-    solids: SolidsBuilder,
-    rng: np.random.Generator,
-    spec: WorldSpec,
-    floor: Floor,
-    frame: Frame,
-    length: float,
-    z: float,
-    rise: float,
-    railing: Railing,
-    built: list[Span],
-) -> Connector | None:
-    """A flight inside the lower plot, up to the shared edge (u axis of ``frame``, lower plot at v > 0)."""
-    for _ in range(12):
-        width = min(float(rng.choice([rng.uniform(1.4, 2.0), rng.uniform(2.0, 4.0)])), length - 0.9)
-        flight: Flight = (
-            draw_ramp(rng, rise, width, (8.0, 15.0))
-            if rng.random() < 0.45
-            else draw_stair(rng, spec, rise, width)
-        )
-        at = float(rng.uniform(0.4, length - width - 0.4)) + width / 2
-        foot = frame.sub(at, flight.length, -np.pi / 2)
-        v = (-width / 2 - 0.1, width / 2 + 0.1)
-        if not floor.fits(foot, (-1.2, flight.length + 0.9), v):
-            continue
-        add_flight(solids, foot, z, flight, (0, 0), base=z - 0.1)
-        floor.reserve(foot, (-1.4, flight.length + 1.2), v, 0.3)
-        if rng.random() < 0.6 and rise > 0.5:
-            for side in (-1, 1):
-                add_railing(
-                    solids,
-                    foot.sub(0.0, side * (width / 2 - 0.04)),
-                    (0.0, flight.length),
-                    z,
-                    railing,
-                    rise=rise,
-                )
-        built.append((at - width / 2, at + width / 2))
-        top = z + rise
-        points = [
-            (-MOUTH, 0.0, z),
-            (0.0, 0.0, z),
-            (flight.length, 0.0, top),
-            (flight.length + MOUTH, 0.0, top),
-        ]
-        return Connector("stair" if flight.steps else "ramp", foot.path(points), width, (0, 0))
+def _shared(a: Plot, b: Plot) -> tuple[Frame, float] | None:
+    """Shared edge of two plots: frame at its start with u along it and v towards ``b``, and its length."""
+    for frame, length in edges(a.frame, a.size):
+        for other, reach in edges(b.frame, b.size):
+            du, dv = other.x - frame.x, other.y - frame.y
+            c, s = np.cos(frame.yaw), np.sin(frame.yaw)
+            end, across = c * du + s * dv, c * dv - s * du
+            if abs(across) > 1e-6 or abs(np.cos(frame.yaw - other.yaw) + 1.0) > 1e-6:
+                continue
+            low, high = max(0.0, end - reach), min(length, end)
+            if high - low > 2.4:
+                return frame.sub(low, 0.0), high - low
     return None
-
-
-def _boundary(solids: SolidsBuilder, rng: np.random.Generator, side: float, high: float) -> None:
-    top = high + float(rng.uniform(1.2, 2.2))
-    for u, v in (
-        ((0.0, side), (0.0, EDGE)),
-        ((0.0, side), (side - EDGE, side)),
-        ((0.0, EDGE), (EDGE, side - EDGE)),
-        ((side - EDGE, side), (EDGE, side - EDGE)),
-    ):
-        block(solids, Frame(0.0, 0.0), u, v, (-0.2, top))

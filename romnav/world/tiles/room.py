@@ -7,7 +7,7 @@ import numpy as np
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Connector, Tile, TileClass
-from romnav.world.tiles.furniture import HALL, ROOM, furnish
+from romnav.world.tiles.furniture import CLUTTER, furnish
 from romnav.world.tiles.site import Floor, Frame, block
 from romnav.world.tiles.stairs import MOUTH, Railing, add_flight, add_railing, draw_ramp, draw_stair
 
@@ -43,7 +43,7 @@ def room(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
         connectors = _stage(solids, rng, spec, floor, corner, inner)
     _screens(solids, rng, floor, corner, inner)
     count = int(rng.poisson(inner[0] * inner[1] / 7.0))
-    furnish(solids, rng, floor, corner, inner, 0.0, ROOM + HALL, count, gap=float(rng.uniform(0.75, 1.0)))
+    furnish(solids, rng, floor, corner, inner, 0.0, CLUTTER, count, gap=float(rng.uniform(0.75, 1.0)))
     return Tile(
         kind=TileClass.ROOM,
         seed=seed,
@@ -94,15 +94,14 @@ def _stage(
             (flight.length, 0.0, rise),
             (flight.length + MOUTH, 0.0, rise),
         ]
-        kind = "stair" if flight.steps else "ramp"
-        connectors.append(Connector(kind, foot.path(points), flight.width, (0, 0)))
+        connectors.append(Connector(flight.kind, foot.path(points), flight.width, (0, 0)))
         at += flight.width
         edge = at
     if guarded and width - edge > 0.5:
         add_railing(solids, stage.sub(0.0, depth - 0.05), (edge, width), rise, railing)
     above = Floor(spec.side)
     above.open(stage, (0.0, width), (0.0, depth - 0.9))
-    furnish(solids, rng, above, stage, (width, depth), rise, ROOM, int(rng.poisson(width * depth / 10.0)))
+    furnish(solids, rng, above, stage, (width, depth), rise, CLUTTER, int(rng.poisson(width * depth / 10.0)))
     return connectors
 
 

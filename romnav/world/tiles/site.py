@@ -59,6 +59,17 @@ def block(
     )
 
 
+def edges(frame: Frame, size: tuple[float, float]) -> list[tuple[Frame, float]]:
+    """Sides of the local rectangle ``[0, size[0]] x [0, size[1]]``: frames with u along and v outward, and lengths."""
+    u, v = size
+    return [
+        (frame.sub(u, 0.0, np.pi), u),
+        (frame.sub(u, v, -np.pi / 2), v),
+        (frame.sub(0.0, v), u),
+        (frame.sub(0.0, 0.0, np.pi / 2), v),
+    ]
+
+
 def cut(outer: tuple[Span, Span], holes: list[tuple[Span, Span]]) -> list[tuple[Span, Span]]:
     """Rectangles that cover ``outer`` less ``holes`` exactly, without overlap."""
     parts = [outer]

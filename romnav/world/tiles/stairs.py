@@ -31,6 +31,11 @@ class Flight:
         """Semantic class of its surface."""
         return Label.STAIR if self.steps else Label.RAMP
 
+    @property
+    def kind(self) -> str:
+        """Kind of a connector of this flight alone."""
+        return "stair" if self.steps else "ramp"
+
 
 @dataclass(frozen=True)
 class Railing:
