@@ -1,0 +1,200 @@
+"""Paired evaluation: every arm walks the same episodes, one row each (paper, Sec. IV-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.scripted import straight_direction, walk
+from romnav.evaluation.spec import EvaluationSpec
+from romnav.navigation.env import to_command
+from romnav.navigation.observations import goal_observation
+from romnav.navigation.perception import LidarPerception
+from romnav.navigation.policy import NavigationActor
+from romnav.navigation.spec import EnvSpec
+from romnav.robot.rom import ReducedOrderModel
+from romnav.world.geodesic import GeodesicLookup
+from romnav.world.world import World
+
+Progress = Callable[[int, int, str], None]
+
+
+class Driver(Protocol):
+    """What commands the robots of a rollout."""
+
+    def command(self, view: View) -> Tensor:
+        """(A, 3) velocity command of the ``A`` episodes still running."""
+        ...
+
+    def select(self, keep: Tensor) -> None:
+        """Drop the memory of all but the rows ``keep``."""
+        ...
+
+
+class View:
+    """What a driver may look at: the running episodes of a rollout, by row."""
+
+    def __init__(self, world: World, episodes: EpisodeSet, env: EnvSpec) -> None:
+        device = str(world.node.device)
+        start = episodes.start(device)
+        count = len(episodes)
+        self.env = env
+        self.episode = torch.arange(count, device=device)
+        self.robot = ReducedOrderModel(world, count, env.period)
+        self.robot.reset(self.episode, start)
+        self.goal = start.goal
+        self.goal_position = world.position[world.goal[start.goal]]
+        self.goal_yaw = start.goal_yaw
+        self.previous = torch.zeros(count, 3, device=device)
+        self.step = 0
+        self._lookup = GeodesicLookup(world)
+
+    def geodesic(self) -> tuple[Tensor, Tensor]:
+        """Distance (A,) to the goal and direction (A, 2) of the shortest path."""
+        r = self.robot
+        return self._lookup(r.tile, r.layer, r.position[:, :2], self.goal)
+
+    def select(self, keep: Tensor) -> None:
+        """Keep only the rows ``keep``."""
+        self.robot.select(keep)
+        for name in ("episode", "goal", "goal_position", "goal_yaw", "previous"):
+            setattr(self, name, getattr(self, name)[keep])
+
+
+class Policy:
+    """A trained policy, acting by the mean of its distributions."""
+
+    def __init__(self, actor: NavigationActor, perception: LidarPerception) -> None:
+        self.actor = actor
+        self.perception = perception
+        actor.reset()
+
+    def command(self, view: View) -> Tensor:
+        """(A, 3) velocity command."""
+        r = view.robot
+        goal = goal_observation(
+            r.position, r.yaw, view.goal_position, view.goal_yaw, view.env.max_goal_distance
+        )
+        counters = torch.stack([view.episode, torch.full_like(view.episode, view.step)], dim=1)
+        obs = TensorDict(
+            {
+                "lidar": self.perception(r.tile, r.position, r.yaw, counters),
+                "state": torch.cat([goal, view.previous], dim=1),
+            },
+            batch_size=[len(view.episode)],
+        )
+        return to_command(self.actor(obs), view.env.command)
+
+    def select(self, keep: Tensor) -> None:
+        """Drop the memory of all but the rows ``keep``."""
+        self.actor.select(keep)
+
+
+class Oracle:
+    """Descends the geodesic field; what remains of its failures is the world's, the dynamics' or the metric's."""
+
+    def command(self, view: View) -> Tensor:
+        """(A, 3) velocity command."""
+        distance, direction = view.geodesic()
+        return walk(direction, view.robot.yaw, distance, view.env.command, view.env.period)
+
+    def select(self, keep: Tensor) -> None:
+        """Nothing to drop."""
+
+
+class Straight:
+    """Turns to the goal and walks: what needs no perception."""
+
+    def command(self, view: View) -> Tensor:
+        """(A, 3) velocity command."""
+        offset = (view.goal_position - view.robot.position)[:, :2]
+        direction = straight_direction(view.robot.position, view.goal_position)
+        distance = torch.linalg.vector_norm(offset, dim=1)
+        return walk(direction, view.robot.yaw, distance, view.env.command, view.env.period)
+
+    def select(self, keep: Tensor) -> None:
+        """Nothing to drop."""
+
+
+SCRIPTED = {"oracle": Oracle, "straight": Straight}
+
+
+@torch.inference_mode()
+def evaluate(
+    driver: Driver,
+    world: World,
+    episodes: EpisodeSet,
+    env: EnvSpec,
+    spec: EvaluationSpec,
+    progress: Progress | None = None,
+) -> dict[str, NDArray]:
+    """Drive all ``episodes`` once; an episode ends at success, at a fall or after ``spec.duration``.
+
+    Returns:
+        One array (n,) per column of the episode rows that a rollout measures: success_time, outcome, time,
+        path_length (planar, sampled once per period), final_distance (geodesic), collisions.
+    """
+    view = View(world, episodes, env)
+    count = len(episodes)
+    device = view.goal.device
+    limit = round(spec.duration / env.period)
+    success_time = torch.full((count,), torch.nan, dtype=torch.float64, device=device)
+    time = torch.full((count,), spec.duration, dtype=torch.float64, device=device)
+    path = torch.zeros(count, dtype=torch.float64, device=device)
+    final = torch.zeros(count, dtype=torch.float64, device=device)
+    collisions = torch.zeros(count, dtype=torch.int64, device=device)
+    fell = torch.zeros(count, dtype=torch.bool, device=device)
+    running = torch.ones(count, dtype=torch.bool, device=device)
+    successes = 0
+    for step in range(1, limit + 1):
+        robot = view.robot
+        command = driver.command(view)
+        before = robot.position[:, :2]
+        robot.step(command)
+        view.previous = command
+        view.step = step
+        row = view.episode
+        alive = running[row]
+        moved = torch.linalg.vector_norm(robot.position[:, :2] - before, dim=1).double()
+        path[row] += torch.where(alive, moved, 0.0)
+        collisions[row] += ((robot.contacts > 0) & alive).long()
+        distance = torch.linalg.vector_norm(view.goal_position - robot.position, dim=1)
+        reached = (distance < spec.reach) & alive & ~robot.fallen
+        over = alive & robot.fallen
+        success_time[row[reached]] = step * env.period
+        time[row[reached | over]] = step * env.period
+        fell[row[over]] = True
+        ended = reached | over | (alive & (step == limit))
+        if ended.any():
+            final[row[ended]] = view.geodesic()[0].double()[ended]
+            running[row[ended]] = False
+        left = int(running.sum())
+        successes = int((~success_time.isnan()).sum())
+        if progress:
+            progress(step, limit, f"reached {successes / count:.0%}, running {left}")
+        if left == 0:
+            break
+        # dropping rows costs copies: do it once a quarter of the batch is idle
+        if left < 0.75 * len(row):
+            keep = running[row].nonzero()[:, 0]
+            view.select(keep)
+            driver.select(keep)
+    if progress:
+        progress(limit, limit, f"reached {successes / count:.0%}")
+    success = ~success_time.isnan().cpu().numpy()
+    outcome = np.where(success, "success", np.where(fell.cpu().numpy(), "fall", "timeout"))
+    measured = {
+        "success_time": success_time,
+        "time": time,
+        "path_length": path,
+        "final_distance": final,
+        "collisions": collisions,
+    }
+    return {"outcome": outcome, **{name: value.cpu().numpy() for name, value in measured.items()}}

@@ -1,0 +1,71 @@
+"""Trained policies on disk: what made them, and errors a user can act on."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from tensordict import TensorDict
+
+from romnav import files
+from romnav.errors import RomnavError
+from romnav.navigation.env import STATE_SIZE
+from romnav.navigation.policy import NavigationActor
+from romnav.navigation.ppo import make_actor
+from romnav.navigation.spec import NavigationSpec
+
+FORMAT = "romnav-policy-1"
+TORN = (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
+
+
+def save(path: Path, content: dict[str, Any]) -> None:
+    """Write ``content`` in one step."""
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, **content}, buffer)
+    with files.atomic(path) as file:
+        file.write(buffer.getvalue())
+
+
+def read(path: Path, device: str = "cpu") -> dict[str, Any]:
+    """Content of a policy or training checkpoint.
+
+    Raises:
+        RomnavError: The file is missing, torn or no policy.
+    """
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        raise RomnavError(f"{path}: no such policy; train it by `romnav train policy ARM`") from None
+    except TORN as error:
+        raise RomnavError(f"{path}: truncated or no checkpoint; delete it and train the arm again") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise RomnavError(f"{path}: key 'format' is not {FORMAT!r}; delete it and train the arm again")
+    return content
+
+
+def load_actor(path: Path, tokens: tuple[int, int], encoder: str, device: str = "cpu") -> NavigationActor:
+    """The policy of ``path`` for ``tokens`` (K, C) of the encoder with digest ``encoder``, in evaluation mode.
+
+    Raises:
+        RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec.
+    """
+    content = read(path, device)
+    if content["encoder"] != encoder:
+        raise RomnavError(
+            f"{path}: key 'encoder' is {content['encoder']}, but the encoder at hand is {encoder}; "
+            "train the arm again or restore the encoder it was trained with"
+        )
+    try:
+        spec = NavigationSpec.model_validate_json(content["spec"])
+        obs = TensorDict({"lidar": torch.zeros(1, *tokens), "state": torch.zeros(1, STATE_SIZE)}, batch_size=[1])
+        actor = make_actor(obs, spec.policy)
+        actor.load_state_dict(content["actor"])
+    except (RuntimeError, ValidationError) as error:
+        reason = str(error).splitlines()[1].strip()
+        raise RomnavError(f"{path}: a policy of another architecture ({reason}); train the arm again") from error
+    return actor.to(device).eval()

@@ -1,0 +1,211 @@
+"""The policy network (paper, Sec. III-B): LiDAR tokens, attention, GRU memory, Beta distributions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import HiddenState
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from romnav.navigation.spec import PolicySpec
+
+LAYERS = 2
+STATE_SCALE = (0.1, 0.1, 1.0, 0.25, 1.0, 1.0, 1.0, 4.0, 1.0)
+"""Brings goal (m) and command (m/s, rad/s) to the order of one."""
+
+
+class GRULayer(torch.autograd.Function):
+    """The recurrent part of one GRU layer over a rollout, with resets between steps.
+
+    Equal to `torch.nn.GRU`; written out so that the weight gradient is one product over all steps, and so that
+    episodes may start inside the rollout without being cut apart and padded.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, gates: Tensor, hidden: Tensor, keep: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """``gates`` (T, B, 3H) input part of (r, z, n); ``hidden`` (B, H) before the first step; ``keep`` (T, B, 1)
+        is 0 where an episode starts. Returns the hidden states (T, B, H)."""
+        steps, batch, width = gates.shape[0], gates.shape[1], hidden.shape[1]
+        out = gates.new_empty(steps, batch, width)
+        before = torch.empty_like(out)
+        activations = torch.empty_like(gates)
+        candidate = torch.empty_like(out)
+        transposed = weight.t()
+        for t in range(steps):
+            h = torch.mul(hidden, keep[t], out=before[t])
+            recurrent = torch.addmm(bias, h, transposed)
+            rz = torch.add(gates[t, :, : 2 * width], recurrent[:, : 2 * width], out=activations[t, :, : 2 * width])
+            rz.sigmoid_()
+            candidate[t].copy_(recurrent[:, 2 * width :])
+            n = torch.addcmul(
+                gates[t, :, 2 * width :], rz[:, :width], candidate[t], out=activations[t, :, 2 * width :]
+            ).tanh_()
+            hidden = torch.lerp(n, h, rz[:, width:], out=out[t])
+        ctx.save_for_backward(before, activations, candidate, keep, weight)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, Tensor, Tensor]:
+        """Gradients with respect to gates, initial hidden state, weight and bias."""
+        before, activations, candidate, keep, weight = ctx.saved_tensors
+        steps, _, width = before.shape
+        d_gates = torch.empty_like(activations)
+        d_recurrent = torch.empty_like(activations)
+        carry = torch.zeros_like(before[0])
+        for t in range(steps - 1, -1, -1):
+            r, z, n = activations[t].split(width, dim=1)
+            d = carry.add_(grad[t])
+            d_z = d * (before[t] - n)
+            d_z.mul_(z).mul_(1 - z)
+            d_n = torch.addcmul(d, d, z, value=-1)
+            d_n.mul_(torch.addcmul(torch.ones_like(n), n, n, value=-1))
+            d_r = d_n * candidate[t]
+            d_r.mul_(r).mul_(1 - r)
+            torch.cat([d_r, d_z, d_n], dim=1, out=d_gates[t])
+            torch.cat([d_r, d_z, d_n * r], dim=1, out=d_recurrent[t])
+            carry = torch.addmm(d * z, d_recurrent[t], weight).mul_(keep[t])
+        flat = d_recurrent.flatten(0, 1)
+        d_weight = flat.t() @ before.flatten(0, 1)
+        return d_gates, carry, None, d_weight, flat.sum(dim=0)
+
+
+class RecurrentCore(nn.Module):
+    """Two-layer GRU over rollouts with episode starts inside them."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        self.width = width
+        reference = nn.GRU(inputs, width, LAYERS)
+        self.input = nn.ModuleList(nn.Linear(inputs if k == 0 else width, 3 * width) for k in range(LAYERS))
+        self.recurrent = nn.ModuleList(nn.Linear(width, 3 * width) for _ in range(LAYERS))
+        for k in range(LAYERS):
+            self.input[k].weight.data.copy_(getattr(reference, f"weight_ih_l{k}"))
+            self.input[k].bias.data.copy_(getattr(reference, f"bias_ih_l{k}"))
+            self.recurrent[k].weight.data.copy_(getattr(reference, f"weight_hh_l{k}"))
+            self.recurrent[k].bias.data.copy_(getattr(reference, f"bias_hh_l{k}"))
+
+    def forward(self, x: Tensor, hidden: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """(T, B, inputs), hidden (layers, B, H), starts (T, B) -> outputs (T, B, H), last hidden (layers, B, H)."""
+        keep = (~starts).to(x.dtype).unsqueeze(2)
+        last = []
+        for k in range(LAYERS):
+            x = GRULayer.apply(
+                self.input[k](x), hidden[k], keep, self.recurrent[k].weight, self.recurrent[k].bias
+            )
+            last.append(x[-1])
+        return x, torch.stack(last)
+
+
+class Attention(nn.Module):
+    """One self-attention layer over the tokens, then cross-attention with learned and non-visual queries."""
+
+    def __init__(self, tokens: int, channels: int, state: int, spec: PolicySpec) -> None:
+        super().__init__()
+        width = spec.attention
+        self.heads = spec.heads
+        self.embed = nn.Linear(channels, width)
+        self.place = nn.Parameter(0.02 * torch.randn(tokens, width))
+        self.self_qkv = nn.Linear(width, 3 * width)
+        self.self_out = nn.Linear(width, width)
+        self.norm = nn.LayerNorm(width)
+        self.queries = nn.Parameter(torch.randn(spec.queries, width) * width**-0.5)
+        self.state_query = nn.Linear(state, width)
+        self.cross_kv = nn.Linear(width, 2 * width)
+        self.cross_out = nn.Linear(width, width)
+        self.outputs = (spec.queries + 1) * width
+
+    def forward(self, tokens: Tensor, state: Tensor) -> Tensor:
+        """Tokens (B, K, C) and state embedding (B, S) -> (B, `outputs`)."""
+        batch = len(tokens)
+        x = self.embed(tokens) + self.place
+        q, k, v = (self._split(part) for part in self.self_qkv(x).chunk(3, dim=2))
+        x = self.norm(x + self.self_out(self._merge(F.scaled_dot_product_attention(q, k, v))))
+        query = torch.cat([self.queries.expand(batch, -1, -1), self.state_query(state)[:, None]], dim=1)
+        k, v = (self._split(part) for part in self.cross_kv(x).chunk(2, dim=2))
+        x = query + self.cross_out(self._merge(F.scaled_dot_product_attention(self._split(query), k, v)))
+        return x.flatten(1)
+
+    def _split(self, x: Tensor) -> Tensor:
+        return x.unflatten(2, (self.heads, -1)).transpose(1, 2)
+
+    def _merge(self, x: Tensor) -> Tensor:
+        return x.transpose(1, 2).flatten(2)
+
+
+class NavigationActor(MLPModel):
+    """rsl-rl actor: attention over frozen LiDAR tokens, GRU, dense layer, Beta distributions over [-1, 1]^3.
+
+    In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts.
+    """
+
+    is_recurrent = True
+
+    def __init__(
+        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, spec: PolicySpec
+    ) -> None:
+        tokens, channels = obs["lidar"].shape[1:]
+        embedding = 64
+        visual = (spec.queries + 1) * spec.attention
+        self._latent = spec.recurrent + visual + embedding
+        super().__init__(
+            obs,
+            obs_groups,
+            obs_set,
+            output_dim,
+            hidden_dims=[spec.hidden],
+            distribution_cfg={"class_name": "BetaDistribution"},
+        )
+        self.register_buffer("scale", torch.tensor(STATE_SCALE))
+        self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim, embedding), nn.ELU())
+        self.attention = Attention(tokens, channels, embedding, spec)
+        self.core = RecurrentCore(visual + embedding, spec.recurrent)
+        self._hidden: Tensor | None = None
+
+    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
+        """``[h_t, visual, state]`` for one step (B, ...) or, with episode starts as ``masks``, a rollout (T, B, ...)."""
+        single = masks is None
+        lead = obs["state"].shape[:-1]
+        state = self.state_embedding(obs["state"].flatten(0, -2) * self.scale)
+        tokens = obs["lidar"].flatten(0, -3).to(state.dtype)
+        seen = torch.cat([self.attention(tokens, state), state], dim=1).unflatten(0, lead)
+        if single:
+            hidden = self._hidden_for(lead[0], seen)
+            starts = torch.zeros(1, lead[0], dtype=torch.bool, device=seen.device)
+            memory, self._hidden = self.core(seen.unsqueeze(0), hidden, starts)
+            memory = memory[0]
+        else:
+            memory, _ = self.core(seen, hidden_state, masks)
+        return torch.cat([memory, seen], dim=-1)
+
+    def reset(self, dones: Tensor | None = None, hidden_state: HiddenState = None) -> None:
+        """Forget everything, restore a memory, or forget the environments that are done."""
+        if dones is None:
+            self._hidden = hidden_state
+        elif self._hidden is not None:
+            self._hidden = self._hidden * (dones == 0).to(self._hidden.dtype)[None, :, None]
+
+    def get_hidden_state(self) -> HiddenState:
+        """Memory (layers, B, H), None before the first step."""
+        return self._hidden
+
+    def select(self, envs: Tensor) -> None:
+        """Keep only the memory of environments ``envs``, in that order."""
+        if self._hidden is not None:
+            self._hidden = self._hidden[:, envs]
+
+    def _hidden_for(self, batch: int, like: Tensor) -> Tensor:
+        if self._hidden is None:
+            self._hidden = like.new_zeros(LAYERS, batch, self.core.width)
+        return self._hidden
+
+    def _get_obs_dim(
+        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str
+    ) -> tuple[list[str], int]:
+        return ["state"], obs["state"].shape[-1]
+
+    def _get_latent_dim(self) -> int:
+        return self._latent

@@ -1,0 +1,110 @@
+"""rsl-rl's PPO over rollouts that are stored once and never cut apart or padded."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import HiddenState
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor
+
+from romnav.navigation.env import ACTIONS
+from romnav.navigation.policy import LAYERS, NavigationActor
+from romnav.navigation.spec import PolicySpec, PPOSpec
+
+
+class Rollout(RolloutStorage):
+    """Rollout whose recurrent minibatches are whole environments, with episode starts in place of padding masks.
+
+    Only the memory before the first step is kept. Minibatches are views: nothing is copied.
+    """
+
+    def _save_hidden_states(self, hidden_states: tuple[HiddenState, HiddenState]) -> None:
+        if self.step == 0:
+            self._first_hidden = hidden_states[0]
+
+    def recurrent_mini_batch_generator(
+        self, num_mini_batches: int, num_epochs: int = 8
+    ) -> Generator[RolloutStorage.Batch, None, None]:
+        """Yield batches (T, B, ...) of ``B = envs / num_mini_batches`` environments."""
+        starts = torch.zeros(self.num_transitions_per_env, self.num_envs, dtype=torch.bool, device=self.device)
+        starts[1:] = self.dones[:-1, :, 0].bool()
+        for _ in range(num_epochs):
+            for envs in torch.arange(self.num_envs).chunk(num_mini_batches):
+                part = slice(int(envs[0]), int(envs[-1]) + 1)
+                yield RolloutStorage.Batch(
+                    observations=self.observations[:, part],
+                    actions=self.actions[:, part],
+                    values=self.values[:, part],
+                    advantages=self.advantages[:, part],
+                    returns=self.returns[:, part],
+                    old_actions_log_prob=self.actions_log_prob[:, part],
+                    old_distribution_params=tuple(p[:, part] for p in self.distribution_params),
+                    hidden_states=(self._first_hidden[:, part], None),
+                    masks=starts[:, part],
+                )
+
+
+class PrivilegedCritic(MLPModel):
+    """Value network on the critic's observation; it has no memory, so episode starts mean nothing to it."""
+
+    def forward(
+        self,
+        obs: TensorDict,
+        masks: Tensor | None = None,
+        hidden_state: HiddenState = None,
+        stochastic_output: bool = False,
+    ) -> Tensor:
+        """(..., 1) values."""
+        return super().forward(obs)
+
+
+class BoundedPPO(PPO):
+    """PPO whose adaptive learning rate stays within bounds."""
+
+    learning_rate_range = (0.0, float("inf"))
+
+    @property
+    def learning_rate(self) -> float:
+        """Current learning rate."""
+        return self._learning_rate
+
+    @learning_rate.setter
+    def learning_rate(self, value: float) -> None:
+        low, high = self.learning_rate_range
+        self._learning_rate = min(max(value, low), high)
+
+
+def make_actor(obs: TensorDict, policy: PolicySpec) -> NavigationActor:
+    """Policy network for the observations ``obs``."""
+    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy)
+
+
+def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str) -> BoundedPPO:
+    """Actor, critic, rollout and optimiser."""
+    actor = make_actor(obs, policy).to(device)
+    actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
+    critic = PrivilegedCritic(
+        obs, {"critic": ["critic"]}, "critic", 1, hidden_dims=list(policy.critic), obs_normalization=True
+    ).to(device)
+    storage = Rollout("rl", envs, spec.steps, obs, [ACTIONS], device)
+    options: dict[str, Any] = {
+        "num_learning_epochs": spec.epochs,
+        "num_mini_batches": spec.minibatches,
+        "clip_param": spec.clip,
+        "gamma": spec.gamma,
+        "lam": spec.lam,
+        "value_loss_coef": spec.value,
+        "entropy_coef": spec.entropy,
+        "max_grad_norm": spec.max_grad_norm,
+        "desired_kl": spec.desired_kl,
+        "learning_rate": spec.learning_rate,
+    }
+    ppo = BoundedPPO(actor, critic, storage, device=device, **options)
+    ppo.learning_rate_range = spec.learning_rate_range
+    return ppo

@@ -1,0 +1,131 @@
+"""Configuration of the navigation task, policy and learning."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from romnav.config import Config
+from romnav.world.spec import SamplerSpec
+
+
+class CommandSpec(Config):
+    """Velocity limits of the command (paper, Sec. III-D)."""
+
+    forward: float = 1.0
+    """Fastest forward, m/s (P)."""
+    reverse: float = 0.5
+    """Fastest backward, m/s (A: the paper names no reverse limit)."""
+    lateral: float = 0.25
+    """Fastest sideways, m/s (P)."""
+    turn: float = 1.0
+    """Fastest turn, rad/s (P)."""
+
+
+class RewardSpec(Config):
+    """Reward terms and weights (paper, Table I)."""
+
+    position: float = 0.2
+    """Weight of the planar position term (P)."""
+    heading: float = 0.2
+    """Weight of the heading term (P)."""
+    height: float = 0.2
+    """Weight of the height term (P)."""
+    stand: float = 0.2
+    """Weight of standing still (P)."""
+    geodesic_progress: float = 0.1
+    """Weight of progress along the geodesic (P)."""
+    height_progress: float = 0.1
+    """Weight of progress in height (P)."""
+    collision: float = -1.0
+    """Weight per body in contact (P)."""
+    action_rate: tuple[float, float] = (-0.01, -0.1)
+    """Weight of the squared change of the command before and after the switch (P)."""
+    action_rate_switch: float = 0.5
+    """Share of the run after which the action-rate weight switches (P: iteration 1000 of 2000)."""
+    gate: float = 2.0
+    """Geodesic distance below which the gated terms pay, m (P)."""
+    progress_speed: float = 0.75
+    """Planar speed that earns the full geodesic progress, m/s (A: a brisk walk leaves room below the limit)."""
+    climb_speed: float = 0.25
+    """Vertical speed that earns the full height progress, m/s (A: a flight of stairs at half of the top speed)."""
+    scale: float = 0.2
+    """Common factor, s (A: the control period, so that returns are integrals over time)."""
+
+
+class EnvSpec(Config):
+    """Episodes of the navigation task."""
+
+    envs: int = 512
+    """Parallel environments (P: 4096)."""
+    period: float = 0.2
+    """Control period, s (P: 5 Hz)."""
+    duration: float = 45.0
+    """Longest episode, s (P)."""
+    stay: float = 45.0
+    """An episode is truncated, not ended, this long after the goal was first reached, s (P: never, it runs on to
+    ``duration``; A: short runs use a few seconds and spend the steps on new goals)."""
+    reach: float = 0.5
+    """Distance in 3D that counts as arrival, m (P)."""
+    max_goal_distance: float = 30.0
+    """d_max of the goal observation, m (P: the geodesic cap)."""
+    command: CommandSpec = CommandSpec()
+    reward: RewardSpec = RewardSpec()
+    sampler: SamplerSpec = SamplerSpec()
+
+
+class PolicySpec(Config):
+    """Network (paper, Sec. III-B)."""
+
+    attention: int = 64
+    """Width of self- and cross-attention (A)."""
+    heads: int = 4
+    """Attention heads (A)."""
+    queries: int = 4
+    """Learned queries of the cross-attention; one more comes from the non-visual observation (P)."""
+    recurrent: int = 128
+    """Width of the two-layer GRU (A)."""
+    hidden: int = 128
+    """Width of the dense layer before the Beta parameters (A)."""
+    critic: tuple[int, ...] = (128, 128)
+    """Hidden widths of the privileged critic (A)."""
+
+
+class PPOSpec(Config):
+    """PPO (Schulman et al., 2017) as rsl-rl implements it."""
+
+    iterations: int = 2000
+    """Iterations of one rollout and one update each (P)."""
+    steps: int = 36
+    """Steps per environment and iteration (A)."""
+    epochs: int = 5
+    """Passes over each rollout (A)."""
+    minibatches: int = 8
+    """Minibatches per pass (P)."""
+    gamma: float = 0.997
+    """Discount per step (A)."""
+    lam: float = 0.95
+    """Generalised advantage estimation (A)."""
+    clip: float = 0.2
+    """Surrogate clip (A)."""
+    entropy: float = 0.003
+    """Entropy coefficient (A)."""
+    value: float = 1.0
+    """Value-loss coefficient (A)."""
+    learning_rate: float = 1e-3
+    """Initial learning rate (A)."""
+    learning_rate_range: tuple[float, float] = (1e-4, 2e-3)
+    """Bounds of the adaptive learning rate (A: small batches measure the KL noisily and would drive it to nothing)."""
+    desired_kl: float = 0.01
+    """Target of the adaptive learning rate (A)."""
+    max_grad_norm: float = 1.0
+    """Gradient clip (A)."""
+
+
+class NavigationSpec(Config):
+    """Everything that the navigation stage needs beside world, sensors and encoder."""
+
+    dynamics: Literal["rom"] = "rom"
+    """The body that is driven."""
+    env: EnvSpec = EnvSpec()
+    policy: PolicySpec = PolicySpec()
+    ppo: PPOSpec = PPOSpec()

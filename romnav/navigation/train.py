@@ -1,0 +1,152 @@
+"""Training of a navigation policy by PPO, resumable at any point (paper, Sec. III-C)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from romnav import files
+from romnav.errors import RomnavError
+from romnav.navigation import checkpoint
+from romnav.navigation.env import NavigationEnv
+from romnav.navigation.perception import LidarPerception
+from romnav.navigation.ppo import make_ppo
+from romnav.navigation.spec import NavigationSpec
+from romnav.robot.rom import ReducedOrderModel
+from romnav.world.world import World
+
+SAVE_EVERY = 120.0
+"""Seconds between checkpoints."""
+
+Progress = Callable[[int, int, str], None]
+
+
+def train(
+    spec: NavigationSpec,
+    world: World,
+    perception: LidarPerception,
+    out: Path,
+    seed: int,
+    *,
+    device: str = "cpu",
+    resume: bool = True,
+    progress: Progress | None = None,
+) -> Path:
+    """Train one policy and write ``out/policy.pt`` and ``out/curve.csv``.
+
+    ``out/checkpoint.pt`` holds the whole state of the run every two minutes: a run that is killed and started again
+    ends in the same weights as one left alone. It is deleted at the end.
+
+    Raises:
+        RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written.
+    """
+    torch.manual_seed(seed)
+    world = world.to(device)
+    dynamics = ReducedOrderModel(world, spec.env.envs, spec.env.period)
+    env = NavigationEnv(world, dynamics, perception, spec.env, seed, device)
+    obs = env.get_observations()
+    ppo = make_ppo(obs, spec.policy, spec.ppo, spec.env.envs, device)
+    identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
+    state = out / "checkpoint.pt"
+    done, seconds, curve = 0, 0.0, []
+    if resume and state.exists():
+        saved = _restore(state, identity, ppo, env, device)
+        done, seconds, curve = saved["iterations"], saved["seconds"], saved["curve"]
+        obs = env.get_observations()
+    ppo.train_mode()
+    saved_at = started = time.monotonic()
+    before = seconds
+    total = spec.ppo.iterations
+    steps = spec.env.envs * spec.ppo.steps
+    while done < total:
+        env.progress = done / total
+        with torch.inference_mode():
+            for _ in range(spec.ppo.steps):
+                obs, reward, dones, extras = env.step(ppo.act(obs))
+                ppo.process_env_step(obs, reward, dones, extras)
+            ppo.compute_returns(obs)
+        losses = ppo.update()
+        done += 1
+        seconds = before + time.monotonic() - started
+        curve.append(_row(done, done * steps, seconds, env, losses, ppo.learning_rate))
+        if progress:
+            progress(done * steps, total * steps, _summary(curve))
+        if time.monotonic() - saved_at > SAVE_EVERY and done < total:
+            _save(state, identity, ppo, env, done, seconds, curve)
+            saved_at = time.monotonic()
+    _write_curve(out / "curve.csv", curve)
+    policy = out / "policy.pt"
+    content = {**identity, "actor": ppo.actor.state_dict(), "steps": total * steps, "hours": seconds / 3600}
+    checkpoint.save(policy, content)
+    state.unlink(missing_ok=True)
+    return policy
+
+
+def _save(
+    path: Path, identity: dict[str, Any], ppo: Any, env: NavigationEnv, done: int, seconds: float, curve: list
+) -> None:
+    content = {
+        **identity,
+        **ppo.save(),
+        "memory": ppo.actor.get_hidden_state(),
+        "env": env.state_dict(),
+        "random": torch.get_rng_state(),
+        "iterations": done,
+        "seconds": seconds,
+        "curve": curve,
+    }
+    checkpoint.save(path, content)
+    _write_curve(path.with_name("curve.csv"), curve)
+
+
+def _restore(path: Path, identity: dict[str, Any], ppo: Any, env: NavigationEnv, device: str) -> dict[str, Any]:
+    content = checkpoint.read(path, device)
+    for key, value in identity.items():
+        if content.get(key) != value:
+            raise RomnavError(
+                f"{path}: belongs to a run with another {key}; delete it, or pass --no-resume to start over"
+            )
+    ppo.load(content, None, True)
+    ppo.actor.reset(hidden_state=content["memory"])
+    env.load_state_dict(content["env"])
+    torch.set_rng_state(content["random"].cpu())
+    return content
+
+
+def _row(
+    done: int, steps: int, seconds: float, env: NavigationEnv, losses: dict[str, float], rate: float
+) -> dict[str, float]:
+    s = env.statistics()
+    row: dict[str, float] = {"iteration": done, "steps": steps, "seconds": round(seconds, 2)}
+    row |= {"episodes": s.episodes, "success": s.success, "same": s.same, "cross": s.cross}
+    row |= {f"reward_{name}": value for name, value in s.reward.items()}
+    row |= {f"loss_{name}": value for name, value in losses.items()}
+    return row | {"learning_rate": rate}
+
+
+def _summary(curve: list[dict[str, float]], window: int = 10) -> str:
+    """Recent success by level, weighted by episodes."""
+
+    def mean(key: str) -> float:
+        rows = [r for r in curve[-window:] if not math.isnan(r[key])]
+        weight = sum(r["episodes"] for r in rows)
+        return sum(r[key] * r["episodes"] for r in rows) / weight if weight else 0.0
+
+    return f"success {mean('success'):.0%} (same {mean('same'):.0%}, cross {mean('cross'):.0%})"
+
+
+def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:
+    if not curve:
+        return
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(curve[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: f"{v:.6g}" for k, v in row.items()} for row in curve)
+    files.write(path, text.getvalue())

@@ -1,0 +1,41 @@
+"""What the navigation task asks of a body, reduced-order or humanoid."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+from romnav.world.spawns import Start
+
+
+class Dynamics(Protocol):
+    """A batch of ``E`` robots driven by velocity commands at the navigation rate.
+
+    Poses are in the tile frame, metres and radians; ``position`` lies on the walking surface under the robot.
+    """
+
+    tile: Tensor
+    """(E,) int64."""
+    layer: Tensor
+    """(E,) int64."""
+    position: Tensor
+    """(E, 3) float32."""
+    yaw: Tensor
+    """(E,) float32."""
+    contacts: Tensor
+    """(E,) float32 bodies in contact with obstacles during the last step."""
+    fallen: Tensor
+    """(E,) bool."""
+
+    def reset(self, envs: Tensor, start: Start) -> None:
+        """Put the robots ``envs`` (K,) at their starts."""
+        ...
+
+    def step(self, command: Tensor) -> None:
+        """Track the command (E, 3) of (vx, vy, wz), m/s and rad/s in the robot's yaw frame, for one period."""
+        ...
+
+    def select(self, envs: Tensor) -> None:
+        """Keep only the robots ``envs`` (K,), in that order."""
+        ...

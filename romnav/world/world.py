@@ -1,0 +1,208 @@
+"""A set of tiles packed for batched use: cells, nodes, goals and their geodesic fields as flat tensors."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from romnav.world.geodesic import fields_many
+from romnav.world.grids import Grids
+from romnav.world.spec import WorldSpec
+from romnav.world.tile import Tile
+from romnav.world.tiles import generate
+
+LEVEL_GAP = 0.5
+"""Heights further apart than this are different levels, m (A: above every curb, below every platform with stairs)."""
+MOUTH_RADIUS = 1.0
+"""A spawn this near to the end of a stair or ramp is at its mouth, m (A)."""
+CACHE_VERSION = 1
+
+
+@dataclass(frozen=True)
+class World:
+    """``T`` tiles with ``L`` layers (the most of any tile) of ``N x N`` cells, and ``G`` goals over all tiles.
+
+    Nodes of all tiles are numbered through; node ids in the packed arrays are global. Fields lie one after the
+    other in `fields`: the distance from node n of a goal's tile is ``fields[field_start[g] + n - node_start[tile]]``.
+    """
+
+    spec: WorldSpec
+    tiles: tuple[Tile, ...]
+    grids: tuple[Grids, ...]
+    node: Tensor
+    """(T, L, N, N) int32 global node of each cell, -1 where occupied."""
+    height: Tensor
+    """(T, L, N, N) float32 height of the walking surface, m; NaN where there is none."""
+    switch: Tensor
+    """(T, L + 1) float32: a robot is on layer l while its height is in (switch[l], switch[l + 1]]."""
+    position: Tensor
+    """(M, 3) float32 node positions, m, tile frame."""
+    layer: Tensor
+    """(M,) int64 layer of each node."""
+    node_start: Tensor
+    """(T + 1,) int64 first node of each tile."""
+    spawn: Tensor
+    """(S,) int64 nodes on or at the mouth of a stair or ramp, tile after tile."""
+    spawn_start: Tensor
+    """(T + 1,) int64 first entry of `spawn` of each tile."""
+    multi_story: Tensor
+    """(T,) bool."""
+    storeys: Tensor
+    """(T,) int64 number of floors."""
+    goal: Tensor
+    """(G,) int64 goal nodes, tile after tile."""
+    goal_start: Tensor
+    """(T + 1,) int64 first goal of each tile."""
+    field_start: Tensor
+    """(G,) int64 offset of each goal's field in `fields`."""
+    fields: Tensor
+    """(sum over goals of the tile's nodes,) uint16 planar geodesic distances, in `geodesic.UNIT`."""
+
+    @property
+    def cell(self) -> float:
+        """Cell side, m."""
+        return self.spec.grid.cell
+
+    def to(self, device: str) -> World:
+        """The same world with its tensors on ``device``."""
+        moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self.__dict__.items()}
+        return World(**moved)
+
+    def index(self, xy: Tensor) -> Tensor:
+        """(E, 2) int64 cell of positions (E, 2), clamped to the tile. The only place where a position becomes a cell."""
+        return (xy / self.cell).floor().long().clamp_(0, self.node.shape[-1] - 1)
+
+    def node_at(self, tile: Tensor, layer: Tensor, xy: Tensor) -> Tensor:
+        """(E,) int64 global node under positions (E, 2) on a layer, -1 where occupied or off the tile."""
+        cell = self.index(xy)
+        inside = ((xy >= 0) & (xy < self.spec.side)).all(dim=1)
+        return torch.where(inside, self.node[tile, layer, cell[:, 0], cell[:, 1]].long(), -1)
+
+    def surface(self, tile: Tensor, layer: Tensor, xy: Tensor) -> Tensor:
+        """(E,) height of the walking surface under positions (E, 2), m."""
+        cell = self.index(xy)
+        return self.height[tile, layer, cell[:, 0], cell[:, 1]]
+
+
+def build(
+    spec: WorldSpec, cache: Path | None = None, progress: Callable[[int, int, str], None] | None = None
+) -> World:
+    """Generate the tiles of ``spec``, choose their goals and compute every goal's geodesic field.
+
+    Goals are drawn uniformly over the free cells off stairs and ramps, half of the draws per floor rather than per
+    cell so that small levels are goals too. ``cache`` is a folder for the finished world; a stale or torn file in it
+    is made anew.
+    """
+    path = cache / f"world-{_key(spec)}.pkl" if cache else None
+    if path and path.exists():
+        try:
+            with path.open("rb") as file:
+                return pickle.load(file)
+        except (pickle.UnpicklingError, EOFError, AttributeError, ImportError):
+            path.unlink()
+    tiles, grids, goals = [], [], []
+    for i in range(spec.tiles):
+        tile, grid = generate(spec, i)
+        tiles.append(tile)
+        grids.append(grid)
+        goals.append(_draw_goals(spec, i, grid))
+        if progress:
+            progress(i + 1, 2 * spec.tiles, "tiles")
+    world = pack(spec, tiles, grids, goals, progress)
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(f".{os.getpid()}.tmp")
+        with temporary.open("wb") as file:
+            pickle.dump(world, file, protocol=5)
+        temporary.replace(path)
+    return world
+
+
+def _key(spec: WorldSpec) -> str:
+    text = json.dumps([CACHE_VERSION, _source_digest(), spec.model_dump(mode="json")], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _source_digest() -> str:
+    """Digest of this package's source: a cached world never outlives the code that made it."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _draw_goals(spec: WorldSpec, index: int, grid: Grids) -> NDArray[np.intp]:
+    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([spec.seed, index, 0x60A1])))
+    flat = np.flatnonzero(~grid.connector)
+    level = np.round(grid.position[flat, 2] / LEVEL_GAP).astype(int)
+    _, inverse, count = np.unique(level, return_inverse=True, return_counts=True)
+    weight = 0.5 / len(flat) + 0.5 / (len(count) * count[inverse])
+    size = min(spec.goals_per_tile, len(flat))
+    return np.sort(rng.choice(flat, size, replace=False, p=weight / weight.sum()))
+
+
+def pack(
+    spec: WorldSpec,
+    tiles: Sequence[Tile],
+    grids: Sequence[Grids],
+    goals: Sequence[NDArray],
+    progress: Callable[[int, int, str], None] | None = None,
+) -> World:
+    """Pack tiles, their grids and their goals (local node ids per tile) into a `World`."""
+    count = grids[0].node.shape[-1]
+    layers = max(g.node.shape[0] for g in grids)
+    node_start = np.concatenate([[0], np.cumsum([len(g.position) for g in grids])])
+    node = np.full((len(tiles), layers, count, count), -1, np.int32)
+    height = np.full(node.shape, np.nan, np.float32)
+    switch = np.full((len(tiles), layers + 1), np.inf, np.float32)
+    switch[:, 0] = -np.inf
+    spawn = []
+    for t, (tile, g) in enumerate(zip(tiles, grids, strict=True)):
+        n = g.node.shape[0]
+        node[t, :n] = np.where(g.node >= 0, g.node + node_start[t], -1)
+        height[t, :n] = g.height
+        switch[t, 1:n] = g.switch
+        spawn.append(np.flatnonzero(_stair_spawns(tile, g)) + node_start[t])
+    local = fields_many(list(grids), [np.asarray(g) for g in goals])
+    if progress:
+        progress(2 * len(tiles), 2 * len(tiles), "geodesic fields")
+    per_goal = np.repeat([len(g.position) for g in grids], [len(g) for g in goals])
+    return World(
+        spec=spec,
+        tiles=tuple(tiles),
+        grids=tuple(grids),
+        node=torch.from_numpy(node),
+        height=torch.from_numpy(height),
+        switch=torch.from_numpy(switch),
+        position=torch.from_numpy(np.concatenate([g.position for g in grids])),
+        layer=torch.from_numpy(np.concatenate([g.layer for g in grids]).astype(np.int64)),
+        node_start=torch.from_numpy(node_start),
+        spawn=torch.from_numpy(np.concatenate(spawn)),
+        spawn_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(s) for s in spawn])])),
+        multi_story=torch.tensor([tile.multi_story for tile in tiles]),
+        storeys=torch.tensor([len(tile.storeys) for tile in tiles]),
+        goal=torch.from_numpy(np.concatenate([g + s for g, s in zip(goals, node_start, strict=False)])),
+        goal_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(g) for g in goals])])),
+        field_start=torch.from_numpy(np.concatenate([[0], np.cumsum(per_goal)[:-1]])),
+        fields=torch.from_numpy(np.concatenate([f.ravel() for f in local])),
+    )
+
+
+def _stair_spawns(tile: Tile, grid: Grids) -> NDArray[np.bool_]:
+    """(M,) nodes on a stair or ramp, or within `MOUTH_RADIUS` of either end of one."""
+    chosen = grid.connector.copy()
+    for connector in tile.connectors:
+        for mouth in connector.path[[0, -1]]:
+            offset = grid.position - mouth
+            chosen |= (np.hypot(offset[:, 0], offset[:, 1]) < MOUTH_RADIUS) & (np.abs(offset[:, 2]) < LEVEL_GAP)
+    return chosen
