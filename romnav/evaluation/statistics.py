@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Literal
@@ -23,7 +25,7 @@ from romnav.evaluation.rows import HORIZONS, Arm
 
 Cluster = Literal["episode", "tile"]
 _DISJOINT: tuple[Level, ...] = ("same", "cross")
-_CHUNK = 128  # resamples at a time: their counts stay in the cache
+_BLOCK = 128  # resamples at a time: their counts stay in the cache
 
 
 @dataclass(frozen=True)
@@ -94,21 +96,14 @@ class Bootstrap:
         self._tails = (50 * (1 - confidence), 50 * (1 + confidence))
         columns = arms[0].runs[0].columns
         self._masks: dict[Level, NDArray] = {level: in_level(columns, level) for level in LEVELS}
-        index: dict[tuple[str, int, Level, str], int] = {}
-        values: list[NDArray] = []
-        for arm in arms:
-            for k, run in enumerate(arm.runs):
-                for name, value in quantities(run.columns).items():
-                    for level in _DISJOINT:
-                        index[arm.name, k, level, name] = len(values)
-                        values.append(value * self._masks[level])
-        table = np.stack(values, axis=1)
-        units, inverse = np.unique(columns[cluster], return_inverse=True)
-        per_unit = np.zeros((len(units), table.shape[1]))
-        np.add.at(per_unit, inverse, table)
-        self._index = index
-        self._point = per_unit.sum(axis=0)
-        self._sums = resampled_sums(per_unit, resamples, seed)
+        self._runs = [(arm.name, quantities(run.columns)) for arm in arms for run in arm.runs]
+        parts = [self._masks[level] for level in _DISJOINT]
+        values = np.array([[[v * part for part in parts] for v in q.values()] for _, q in self._runs])
+        order = np.argsort(columns[cluster], kind="stable")
+        _, starts = np.unique(columns[cluster][order], return_index=True)
+        per_unit = np.add.reduceat(values[..., order], starts, axis=-1)
+        self._totals = per_unit.sum(axis=-1)  # (runs, quantities, disjoint levels)
+        self._sums = resampled_sums(per_unit, resamples, seed)  # the same, resamples
         self._seed_weights = {arm.name: _seed_weights(arm, resamples, seed) for arm in arms}
 
     def metric(self, arm: str, metric: str, level: Level = "all") -> Estimate:
@@ -134,16 +129,17 @@ class Bootstrap:
 
     def _ratio(self, arm: str, metric: Metric, level: Level) -> tuple[float, NDArray]:
         """The metric's value, and its value in every resample, shape (resamples,)."""
-        levels = _DISJOINT if level == "all" else (level,)
-        weights = self._seed_weights[arm]
-        point, draws = [], []
-        for name in (metric.numerator, metric.denominator):
-            where = [[self._index[arm, k, part, name] for part in levels] for k in range(weights.shape[1])]
-            point.append(self._point[where].sum())
-            draws.append((self._sums[:, where].sum(axis=2) * weights).sum(axis=1))
+        runs = [k for k, (name, _) in enumerate(self._runs) if name == arm]
+        levels = slice(None) if level == "all" else slice(k := _DISJOINT.index(level), k + 1)
+        names = list(self._runs[0][1])
+        value, draws = [], []
+        for quantity in (names.index(metric.numerator), names.index(metric.denominator)):
+            value.append(self._totals[runs, quantity, levels].sum())
+            draws.append(
+                (self._sums[runs, quantity, levels].sum(axis=1) * self._seed_weights[arm]).sum(axis=0)
+            )
         with np.errstate(invalid="ignore", divide="ignore"):
-            value, samples = (metric.scale * num / den for num, den in (point, draws))
-        return float(value), samples
+            return float(metric.scale * value[0] / value[1]), metric.scale * draws[0] / draws[1]
 
     def _interval(self, draws: NDArray) -> tuple[float, float]:
         """Percentile interval of the resamples in which the statistic exists."""
@@ -155,35 +151,37 @@ class Bootstrap:
 
 
 def resampled_sums(values: NDArray, resamples: int, seed: int = 0) -> NDArray:
-    """Column sums of rows drawn with replacement, every column over the same draws.
+    """Sums over units drawn with replacement, the same draws for every quantity.
 
     Args:
-        values: Values per resampled unit, shape (n, columns).
-        resamples: Number of resamples of n rows each.
+        values: Values per unit, shape (..., n).
+        resamples: Number of resamples of n units each.
         seed: Seed; block k of the resamples has the stream (seed, k), so more resamples extend fewer.
 
     Returns:
-        Sums, shape (resamples, columns).
+        Sums, shape (..., resamples). Values are rounded to single precision; counts are summed exactly.
     """
-    return np.concatenate([counts @ values for counts in _counts(len(values), resamples, seed)])
+    n = values.shape[-1]
+    flat = values.reshape(-1, n).astype(np.float32)
+    offsets = n * np.arange(_BLOCK)[:, None]
 
+    def block(k: int) -> NDArray:
+        stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(k,))))
+        drawn = stream.integers(0, n, (_BLOCK, n), dtype=np.uint16 if n <= 2**16 else np.uint32)
+        counts = np.bincount((drawn + offsets).ravel(), minlength=_BLOCK * n).reshape(_BLOCK, n)
+        return flat @ counts.T.astype(np.float32)
 
-def _counts(n: int, resamples: int, seed: int) -> Iterator[NDArray]:
-    """How often each resample drew each unit, in blocks of shape (<= _CHUNK, n)."""
-    offsets = n * np.arange(_CHUNK)[:, None]
-    for block, start in enumerate(range(0, resamples, _CHUNK)):
-        stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(block,))))
-        drawn = stream.integers(0, n, (_CHUNK, n), dtype=np.uint16 if n <= 2**16 else np.uint32)
-        counts = np.bincount((drawn + offsets).ravel(), minlength=_CHUNK * n).reshape(_CHUNK, n)
-        yield counts[: resamples - start].astype(float)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        sums = np.concatenate(list(pool.map(block, range(-(-resamples // _BLOCK)))), axis=1)
+    return sums[:, :resamples].reshape(*values.shape[:-1], resamples).astype(float)
 
 
 def _seed_weights(arm: Arm, resamples: int, seed: int) -> NDArray:
-    """How often each resample drew each training seed of an arm, shape (resamples, seeds)."""
+    """How often each resample drew each training seed of an arm, shape (seeds, resamples)."""
     name = int.from_bytes(hashlib.sha256(arm.name.encode()).digest()[:4])
     stream = np.random.default_rng([seed, name])
     seeds = len(arm.runs)
-    return stream.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples)
+    return stream.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples).T
 
 
 def mcnemar_mid_p(a_only: int, b_only: int) -> float:
@@ -194,8 +192,11 @@ def mcnemar_mid_p(a_only: int, b_only: int) -> float:
         b_only: Pairs in which only b succeeded.
     """
     n, k = a_only + b_only, min(a_only, b_only)
-    twice_tail = 2 * sum(math.comb(n, i) for i in range(k)) + math.comb(n, k)
-    return twice_tail / 2**n
+    term, below = 1, 0  # binomial coefficient of n over i, and the sum of those before
+    for i in range(k):
+        below += term
+        term = term * (n - i) // (i + 1)
+    return (2 * below + term) / 2**n
 
 
 def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:

@@ -144,7 +144,12 @@ def build_all(arms: Sequence[Arm]) -> list[Table]:
 
 
 def build(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> Table:
-    """Makes a table of the arms of a bootstrap; trained arms that were not evaluated are shown as dashes."""
+    """Makes a table of the arms of a bootstrap; trained arms that were not evaluated are shown as dashes.
+
+    Raises:
+        RomnavError: No arm of the table was evaluated.
+    """
+    provenance, note = _provenance(spec, bootstrap)
     if isinstance(spec, PerformanceSpec):
         spans: tuple[tuple[str, int], ...] = ()
         header = ("Arm", *(column.header for column in spec.columns))
@@ -155,7 +160,6 @@ def build(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> Table:
         header = ("Contrast (%)", *(level for _, level in _BY_LEVEL))
         keys = tuple(f"sr_{horizon}_{level}" for horizon, level in _BY_LEVEL)
         ours, published = _levels(spec, bootstrap)
-    provenance, note = _provenance(spec, bootstrap)
     groups = (("ours", f"This work, {provenance['scale']} scale", ours), ("paper", "Paper", published))
     blocks = tuple(
         Block(source, title if k == 0 else "", rows)
@@ -225,14 +229,18 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     """Provenance of the evaluated arms of a table, and the end of its caption that states it."""
     shown = [bootstrap.arms[e.arm] for e in spec.entries if e.arm in bootstrap.arms]
     runs = [run for arm in shown for run in arm.runs]
+    if not runs:
+        raise RomnavError(
+            f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first"
+        )
     trained = [arm for arm in shown if any(run.provenance.steps for run in arm.runs)]
     facts = {
-        "scale": _range(run.provenance.scale for run in runs),
-        "commit": _range(run.provenance.commit[:12] for run in runs),
+        "scale": _list(run.provenance.scale for run in runs),
+        "commit": _list(run.provenance.commit[:12] for run in runs),
         "episode_set": runs[0].provenance.episode_set,
     }
-    steps = _range(f"{run.provenance.steps / 1e6:.3g} M" for arm in trained for run in arm.runs)
-    seeds = _range(str(len(arm.runs)) for arm in trained)
+    steps = _list(f"{run.provenance.steps / 1e6:.3g} M" for arm in trained for run in arm.runs)
+    seeds = _list(str(len(arm.runs)) for arm in trained)
     note = (
         f"This work: {facts['scale']} scale, training of {steps} steps, training seeds per arm: {seeds}; "
         f"{len(runs[0])} paired episodes of set {facts['episode_set'][:12]}; commit {facts['commit']}. "
@@ -241,5 +249,5 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     return facts, note
 
 
-def _range(texts: Iterable[str]) -> str:
+def _list(texts: Iterable[str]) -> str:
     return ", ".join(sorted(set(texts)))

@@ -187,6 +187,15 @@ def test_no_table_without_its_reference_arm(episode_rows) -> None:
         tables.build_all(rows.pair([episode_rows("rom")]))
 
 
+def test_a_table_needs_one_of_its_arms(episode_rows) -> None:
+    bootstrap = Bootstrap(rows.pair([episode_rows("uniform")]))
+    with pytest.raises(RomnavError, match="table nav-levels: no arm .* evaluate rom-nav first"):
+        tables.build(tables.SPECS[3], bootstrap)
+    lone = tables.build(tables.SPECS[1], bootstrap)  # the reference is missing: nothing to subtract from
+    assert {cell.text for r in lone.blocks[0].rows for cell in r.cells} == {"–"}
+    assert row(read_latex(formats.latex(lone)), "RoM $-$ Uniform") == ["--"] * 4
+
+
 def test_every_arm_that_competes_has_published_numbers() -> None:
     for spec in tables.SPECS:
         arms = [entry.arm for entry in spec.entries if entry not in spec.bounds]
