@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from romnav.config import Config
@@ -43,3 +45,18 @@ class WorldSpec(Config):
     """Goal cells per tile, each with its own geodesic field (A: memory, 2 bytes per free cell and goal)."""
     grid: GridSpec = GridSpec()
     """Occupancy grids."""
+
+
+class SamplerSpec(Config):
+    """Spawn and goal distribution (paper, Sec. III-D)."""
+
+    stair_probability: float = 0.3
+    """Share of spawns on or at the mouth of a stair or ramp (P); 0 is the paper's Uniform arm."""
+    cap: Literal["geodesic", "euclidean"] = "geodesic"
+    """Distance by which goals are capped (P); "euclidean" is the paper's NoCap arm."""
+    max_distance: float = 30.0
+    """Cap, m (P)."""
+    min_distance: float = 1.0
+    """Nearest goal, geodesic, m (A: nearer ones are reached by standing still)."""
+    cross_probability: float = 0.5
+    """Share of cross-level goals where a tile has any (P); three-story tiles always draw them (P)."""
