@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.resources
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
@@ -146,3 +145,112 @@ def build_spec(spec: RobotSpec, ground: Boxes, *, visual: bool = False) -> mujoc
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.iterations, option.ls_iterations = 10, 20
     return model
+
+
+def _single(array: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32))
+
+
+class Humanoids:
+    """A batch of G1 robots, each alone on the same ground, stepped by native MuJoCo on all cores.
+
+    Results do not depend on the number of threads. Tensors are float32 copies of MuJoCo's float64 state.
+
+    Attributes:
+        pelvis, orientation, velocity, spin: (n, 3) position, (n, 3, 3) rotation, (n, 3) world linear and
+            (n, 3) body angular velocity of the pelvis; m, m/s, rad/s.
+        joints, joint_velocity: (n, 15), rad, rad/s, in the order of `JOINTS`.
+        com, com_velocity: (n, 3) of the whole robot, world.
+        ankle, ankle_rotation: (n, 2, 3), (n, 2, 3, 3) of the ankle-roll bodies, left and right, world.
+        anchor, axis: (n, 15, 3) joint anchors and axes, world.
+        touch: (n, bodies) whether each collision body is in contact; `feet` are the columns of the feet.
+    """
+
+    def __init__(self, spec: RobotSpec, ground: Boxes, count: int, *, threads: int = 0) -> None:
+        self.spec, self.count = spec, count
+        self.model = build_spec(spec, ground).compile()
+        self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
+        self.kp = torch.tensor(self.model.actuator_gainprm[:, 0], dtype=torch.float32)
+        self.mass = float(self.model.body_subtreemass[1])
+        self.joint_range = torch.tensor(self.model.jnt_range[1:], dtype=torch.float32)
+        self.torque_limit = torch.tensor(self.model.jnt_actfrcrange[1:, 1], dtype=torch.float32)
+        touch = [
+            self.model.sensor(i) for i in range(self.model.nsensor) if self.model.sensor(i).name.startswith("touch")
+        ]
+        self.touch_names = [sensor.name.removeprefix("touch_") for sensor in touch]
+        self._touch = [int(sensor.adr[0]) for sensor in touch]
+        self._com_velocity = int(self.model.sensor("com_velocity").adr[0])
+        self.feet = [self.touch_names.index(f"{side}_ankle_roll_link") for side in SIDES]
+        self._ankles = [self.model.body(f"{side}_ankle_roll_link").id for side in SIDES]
+        for field in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
+            self.batch.bind(field)
+        for field in ("xpos", "xmat", "subtree_com", "xanchor", "xaxis", "sensordata", "actuator_force"):
+            self.batch.bind(field)
+        self.touch = torch.zeros(count, len(touch), dtype=torch.bool)
+        self.torque = torch.zeros(count, len(JOINTS))
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._read()
+
+    def _read(self) -> None:
+        b = self.batch
+        qpos, qvel = _single(b.qpos), _single(b.qvel)
+        self.pelvis, self.joints = qpos[:, :3], qpos[:, 7:]
+        self.velocity, self.spin, self.joint_velocity = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
+        self.orientation = _single(b.xmat[:, 1]).view(-1, 3, 3)
+        self.com = _single(b.subtree_com[:, 1])
+        self.com_velocity = _single(b.sensordata[:, self._com_velocity : self._com_velocity + 3])
+        self.ankle = _single(b.xpos[:, self._ankles])
+        self.ankle_rotation = _single(b.xmat[:, self._ankles]).view(-1, 2, 3, 3)
+        self.anchor, self.axis = _single(b.xanchor[:, 1:]), _single(b.xaxis[:, 1:])
+
+    def step(self, target: Tensor) -> None:
+        """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms)."""
+        self.batch.ctrl[:] = target.numpy()
+        self.batch.step(nstep=self.spec.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.touch = torch.from_numpy(self.batch.sensordata[:, self._touch] > 0)
+        self.torque = _single(self.batch.actuator_force)
+        self._read()
+
+    def set_state(self, ids: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """Put robots `ids` into states (k, 22) and (k, 21); they touch nothing until they are stepped."""
+        if len(ids) == 0:
+            return
+        index = ids.numpy()
+        self.batch.reset(ids=index, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.batch.qpos[index] = qpos.double().numpy()
+        self.batch.qvel[index] = qvel.double().numpy()
+        self.batch.forward(ids=index, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.touch[ids] = False
+        self.torque[ids] = 0.0
+        self._read()
+
+    def push(self, ids: Tensor, velocity: Tensor) -> None:
+        """Add horizontal velocity (k, 2), m/s, to the pelvis of robots `ids`."""
+        if len(ids) == 0:
+            return
+        self.batch.qvel[ids.numpy(), :2] += velocity.double().numpy()
+        self.batch.forward(ids=ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._read()
+
+    def randomize(self, friction: Tensor, payload: Tensor) -> None:
+        """Give every robot its own foot friction (n,) and torso payload (n,), kg."""
+        soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in (0, 1)]
+        self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
+        torso = self.model.body("torso_link").id
+        self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
+        self.batch.set_const()
+
+    def state_dict(self) -> dict[str, NDArray]:
+        """All that decides the future: MuJoCo's integration state and the last contacts."""
+        names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
+        return {name: getattr(self.batch, name).copy() for name in names} | {
+            "touch": self.touch.numpy().copy(), "torque": self.torque.numpy().copy(),
+        }  # fmt: skip
+
+    def load_state_dict(self, state: dict[str, NDArray]) -> None:
+        """Continue from `state_dict`."""
+        for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
+            getattr(self.batch, name)[:] = state[name]
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.touch, self.torque = torch.from_numpy(state["touch"].copy()), torch.from_numpy(state["torque"].copy())
+        self._read()

@@ -20,9 +20,163 @@ class RobotSpec(Config):
     """Knee and waist position gain, N m/rad (A: the knee carries the weight on stairs)."""
     kp_ankle: float = 40.0
     """Ankle position gain, N m/rad (A)."""
-    kd_ratio: float = 0.03
+    kd_ratio: float = 0.08
     """Velocity gain over position gain, s (A)."""
     weld_arms: bool = True
     """Fix the 14 arm joints at `elbow` (A: 15 instead of 29 joints halve the cost; navigation never uses the arms)."""
     elbow: float = 1.2
     """Elbow angle of the fixed arms, rad (A)."""
+
+
+class GaitSpec(Config):
+    """The linear-inverted-pendulum reference (A throughout: the paper's cited work gives no numbers here)."""
+
+    step_ticks: int = 20
+    """Control steps of one step: 0.4 s."""
+    pendulum: float = 0.66
+    """Height of the centre of mass above the ground that sets the pendulum's frequency, m."""
+    pelvis: float = 0.73
+    """Height of the pelvis above the mean of both feet's ground, m: bent knees."""
+    sink: float = 0.25
+    """How much the pelvis sinks for each metre of height between the feet, -: keeps both in reach on stairs."""
+    width: float = 0.22
+    """Distance between the feet, m."""
+    clearance: float = 0.09
+    """Apex of the swing foot above the highest ground under its path, m."""
+    swing_end: float = 1.0
+    """Part of the step after which the swing foot is to stand."""
+    reach_forward: tuple[float, float] = (-0.40, 0.58)
+    """Limits of a foothold ahead of the stance foot, m."""
+    reach_side: tuple[float, float] = (0.14, 0.42)
+    """Limits of a foothold beside the stance foot, m."""
+    edge_search: float = 0.14
+    """How far a foothold may be moved along the heading to keep the sole off a stair's edge, m."""
+    pull: float = 0.6
+    """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's share of balance."""
+    upright_gain: float = 1.0
+    """Extra stance correction per radian of pelvis tilt, -."""
+
+
+class ClfSpec(Config):
+    """Control-Lyapunov reward on the tracking error (CLF-RL; form P, numbers A)."""
+
+    rate_time: float = 0.1
+    """Time that makes a rate error comparable to a position error in Q = diag(1, rate_time^2), s."""
+    effort: float = 1e-4
+    """Weight R of the acceleration in the Riccati equation, s^4."""
+    sigma: float = 1.5
+    """Scale of V, mean over outputs in squared tolerances, -."""
+    com: float = 0.08
+    """Tolerance of the centre of mass from its orbit, m."""
+    height: float = 0.04
+    """Tolerance of the pelvis height, m."""
+    tilt: float = 0.12
+    """Tolerance of roll, pitch and yaw of the pelvis, rad."""
+    swing: float = 0.05
+    """Tolerance of the swing sole, m."""
+    foot: float = 0.2
+    """Tolerance of the swing sole's roll and pitch, rad."""
+
+
+class RewardSpec(Config):
+    """Weights of the reward terms, each per control step (A; terms of CLF-RL and its regularisers)."""
+
+    scale: float = 0.2
+    """Of the sum: a good step earns about 0.5."""
+    clf: float = 1.0
+    """exp(-V / sigma) + 1 / (2 (1 + V))."""
+    decrease: float = 0.2
+    """Penalty clip((dV/dt + lambda V) / sigma, 0, 1)."""
+    velocity: float = 1.5
+    """exp(-(e / 0.2)^2) of the velocity averaged over about a step, gated by the yaw-rate term."""
+    velocity_linear: float = 0.6
+    """Penalty on |e| itself: a gradient where the exponential is flat (stepping in place is a local optimum)."""
+    yaw: float = 0.6
+    """exp(-(e / 0.4)^2) of the averaged yaw rate."""
+    upright: float = 1.5
+    """Penalty on the horizontal part of gravity, squared."""
+    action: float = 0.01
+    """Penalty on the sum of squared actions."""
+    action_rate: float = 0.01
+    """Penalty on the sum of squared action differences."""
+    torque: float = 4e-6
+    """Penalty on the sum of squared torques, (N m)^-2."""
+    collision: float = 0.3
+    """Penalty on each body but the feet in contact."""
+    alive: float = 0.5
+    """For not having fallen."""
+    fall: float = 2.0
+    """Penalty once, not scaled, for a fall."""
+    floor: float = -0.5
+    """Lower bound of a step's reward, so that ending the episode never pays."""
+
+
+class TaskSpec(Config):
+    """The locomotion task."""
+
+    robots: int = 256
+    """Robots in parallel."""
+    episode: float = 20.0
+    """Longest episode, s."""
+    action_scale: float = 0.3
+    """Residual joint angle of one unit of action, rad."""
+    shares: dict[str, float] = {"flat": 0.25, "rough": 0.05, "ramp": 0.14, "stairs": 0.42, "uturn": 0.14}
+    """Share of the robots on each kind of terrain."""
+    forward: tuple[float, float] = (-0.5, 1.0)
+    """Commanded forward velocity on the flat, m/s (forward limit P)."""
+    lateral: float = 0.25
+    """Commanded lateral velocity, m/s (P)."""
+    turn: float = 1.0
+    """Commanded yaw rate, rad/s (P)."""
+    lane_speed: tuple[float, float] = (0.35, 0.9)
+    """Commanded speed along lanes, m/s."""
+    resample: float = 5.0
+    """Time between new commands on the flat, s."""
+    push: float = 0.4
+    """Largest push, m/s, on the pelvis."""
+    push_interval: float = 5.0
+    """Mean time between pushes, s."""
+    friction: tuple[float, float] = (0.5, 1.1)
+    """Range of foot friction."""
+    payload: tuple[float, float] = (-1.0, 2.0)
+    """Range of mass added to the torso, kg."""
+
+
+class PpoSpec(Config):
+    """PPO by rsl-rl."""
+
+    steps: int = 24
+    """Control steps per iteration."""
+    epochs: int = 4
+    """Passes over the batch."""
+    minibatches: int = 4
+    """Per pass."""
+    hidden: tuple[int, ...] = (256, 128, 64)
+    """Widths of the policy and of the critic."""
+    learning_rate: tuple[float, float] = (2e-4, 1e-3)
+    """Range of the adaptive rate: below the floor a small batch collapses it."""
+    desired_kl: float = 0.01
+    """Of the adaptive rate."""
+    entropy: float = 0.003
+    """Weight of the entropy."""
+    std: tuple[float, float, float] = (0.12, 0.25, 1.0)
+    """Floor, start and ceiling of the action noise, in units of action."""
+    gamma: float = 0.99
+    """Discount."""
+    lam: float = 0.95
+    """Of generalised advantages."""
+
+
+class LocomotionSpec(Config):
+    """Everything that decides a locomotion policy."""
+
+    robot: RobotSpec = RobotSpec()
+    gait: GaitSpec = GaitSpec()
+    clf: ClfSpec = ClfSpec()
+    reward: RewardSpec = RewardSpec()
+    task: TaskSpec = TaskSpec()
+    ppo: PpoSpec = PpoSpec()
+    iterations: int = 4000
+    """PPO iterations."""
+    seed: int = 1
+    """Of everything random."""

@@ -1,0 +1,1 @@
+"""Velocity-tracking walking: LIP references, a control-Lyapunov reward and PPO (CLF-RL)."""
