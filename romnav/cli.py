@@ -238,11 +238,14 @@ def _plan(ctx: typer.Context, scale: str) -> Plan:
 def _execute(plan: Plan, targets: list[Stage], device: str, resume: bool, kinds: Collection[str]) -> None:
     """Runs what the targets need; without ``resume``, stages of the given ``kinds`` start over."""
     from romnav.experiment.run import pending
+    from romnav.experiment.stages import require_device
 
     stages = pending(targets, () if resume else kinds)
-    if not stages:
+    if stages:
+        require_device(device)
+        _perform(plan, stages, device, resume)
+    else:
         typer.echo("nothing to do: everything is finished and up to date", err=True)
-    _perform(plan, stages, device, resume)
 
 
 def _perform(plan: Plan, stages: list[Stage], device: str, resume: bool) -> None:

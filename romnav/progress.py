@@ -20,12 +20,14 @@ class Meter:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._started = clock()
-        self._first: tuple[float, int] | None = None
+        self._first: tuple[float, int, int] | None = None
 
     def describe(self, done: int, total: int, metric: str) -> str:
         """One line: share, units, rate, time elapsed, time left and the metric."""
         now = self._clock()
-        start, before = self._first = self._first or (now, done)
+        if self._first is None or self._first[2] != total:  # another total is another task
+            self._first = (now, done, total)
+        start, before, _ = self._first
         rate = (done - before) / (now - start) if now > start else 0.0
         left = duration((total - done) / rate) if rate > 0 else "?"
         share = f"{done / total:4.0%}" if total else "   ?"

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from romnav.config import Config
+from romnav.errors import RomnavError
 from romnav.experiment.project import Project
 from romnav.experiment.scales import Scale, ScaleFile
-from romnav.experiment.spec import SCRIPTED
+from romnav.experiment.spec import SCRIPTED, suggest
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,7 @@ class Plan:
             RomnavError: No experiment has this arm, or its changes are invalid.
         """
         name, experiment = self.project.having(arm)
-        return self.scale.changed(
-            arm, experiment.arms[arm], self.project.root / "experiments" / f"{name}.toml"
-        )
+        return self.scale.changed(arm, experiment.arms[arm], self.project.file(name))
 
     def encoder(self, settings: Scale | None = None) -> Stage:
         """The LiDAR encoder; an arm that changes it gets one of its own."""
@@ -97,11 +96,11 @@ class Plan:
             kind="encoder",
             name="encoder lidar",
             folder=self.folder / "encoder" / "lidar",
-            outputs=("encoder.pt",),
+            outputs=("encoder.pt", "curve.csv"),
             record=self.folder / "encoder" / "lidar" / "encoder.json",
             settings=settings or self.scale.settings,
             uses=("world", "lidar", "pretrain"),
-            scratch=("checkpoint.pt",),
+            scratch=("state.pt",),
         )
         if settings is None or stage.key == self.encoder().key:
             return stage
@@ -128,10 +127,11 @@ class Plan:
 
     def episodes(self, arm: str, seed: int) -> Stage:
         """The evaluated episodes of a trained or scripted arm."""
-        upstream: tuple[Stage, ...] = ()
+        settings: Config = self.scale.settings
         uses: tuple[str, ...] = ("evaluation",)
+        upstream: tuple[Stage, ...] = ()
         if arm in SCRIPTED:
-            seed, settings = 0, self.scale.settings
+            seed = 0
             uses += ("navigation.dynamics", "navigation.env")
         else:
             policy = self.policy(arm, seed)
@@ -153,8 +153,20 @@ class Plan:
         )
 
     def tables(self, name: str, seeds: Iterable[int]) -> Stage:
-        """The tables of an experiment."""
+        """The tables of an experiment.
+
+        Raises:
+            RomnavError: There is no such experiment or table, or its arms are invalid.
+        """
+        from romnav.report.tables import SPECS
+
         experiment = self.project.experiment(name)
+        known = {spec.name for spec in SPECS}
+        for table in experiment.tables:
+            if table not in known:
+                raise RomnavError(
+                    f"{self.project.file(name)}: tables: unknown table {table}{suggest(table, known)}"
+                )
         arms = [(arm, seed) for arm in experiment.arms for seed in seeds]
         return Stage(
             kind="tables",

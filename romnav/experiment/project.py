@@ -49,6 +49,10 @@ class Project:
             raise RomnavError(f"unknown experiment {name}{suggest(name, self.experiments)}")
         return self.experiments[name]
 
+    def file(self, experiment: str) -> Path:
+        """The file of an experiment."""
+        return self.root / "experiments" / f"{experiment}.toml"
+
     def having(self, arm: str) -> tuple[str, Experiment]:
         """An experiment that has a trained arm.
 

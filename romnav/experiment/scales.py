@@ -60,6 +60,6 @@ def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     merged = dict(base)
     for key, value in changes.items():
         below = merged.get(key)
-        nested = isinstance(value, dict) and isinstance(below, dict)
-        merged[key] = _merge(below, value) if nested else value
+        both = isinstance(value, dict) and isinstance(below, dict)
+        merged[key] = _merge(below or {}, value) if both else value
     return merged

@@ -16,7 +16,7 @@ from romnav.errors import RomnavError
 
 SCRIPTED = ("oracle", "straight")
 """Arms that need no training; every ablation is evaluated beside them."""
-RESERVED = {*SCRIPTED, "encoder", "tables", "figures"}
+RESERVED = {*SCRIPTED, "encoder", "locomotion", "tables", "figures"}
 """Names of other folders beside those of the arms."""
 
 C = TypeVar("C", bound=Config)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from romnav import __version__
 from romnav.errors import RomnavError
@@ -13,13 +13,29 @@ from romnav.experiment import store
 from romnav.experiment.plan import Plan, Stage, digest
 from romnav.experiment.run import Action
 from romnav.experiment.scales import Scale
-from romnav.experiment.spec import SCRIPTED, suggest
+from romnav.experiment.spec import SCRIPTED, Experiment
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
     from romnav.navigation.perception import LidarPerception
+    from romnav.sensing.lidar import Lidar
     from romnav.world.spec import WorldSpec
     from romnav.world.world import World
+
+
+def require_device(device: str) -> None:
+    """Checks that a device is there.
+
+    Raises:
+        RomnavError: It is not, or its name is none.
+    """
+    import torch
+
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise RomnavError(f"device {device}: {reason}; use cpu, cuda or cuda:N") from error
 
 
 @dataclass(frozen=True)
@@ -48,21 +64,26 @@ class Stages:
         """Pretrains the LiDAR encoder."""
         from romnav.sensing.pretrain import pretrain
 
-        settings: Any = stage.settings
+        settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
-        return (
-            pretrain(
-                settings.pretrain, settings.lidar, world, stage.folder, device=self.device, progress=progress
-            )
-            or {}
+        pretrain(
+            settings.pretrain,
+            list(zip(world.tiles, world.grids, strict=True)),
+            self._lidar(settings, world),
+            settings.lidar.height,
+            stage.folder,
+            device=self.device,
+            progress=progress,
+            resume=self.resume,
         )
+        return {}
 
     def policy(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Trains the policy of an arm."""
         from romnav.navigation import checkpoint
         from romnav.navigation.train import train
 
-        settings: Any = stage.settings
+        settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
         perception = self._perception(stage.upstream[0], settings, world)
         path = train(
@@ -83,10 +104,10 @@ class Stages:
         from romnav.evaluation import episodes, rollout, rows
         from romnav.navigation import checkpoint
 
-        settings: Any = stage.settings
+        settings = cast(Scale, stage.settings)
         paired = episodes.load(self.plan.episode_set)
         world = episodes.terrain(paired, self.plan.episode_set, self._worlds).to(self.device)
-        facts = {"steps": 0, "hours": 0.0}
+        facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
         policy = None
         if stage.arm in SCRIPTED:
             driver: Any = rollout.SCRIPTED[stage.arm]()
@@ -115,7 +136,7 @@ class Stages:
             **facts,
         )
         count = len(paired)
-        columns = {
+        columns: dict[str, Any] = {
             "arm": [stage.arm] * count,
             "seed": [stage.seed] * count,
             "episode": range(count),
@@ -136,10 +157,8 @@ class Stages:
         arms = results.load(self.plan.project.results, self.plan.scale.name)
         bootstrap = Bootstrap(arms)
         specs = {spec.name: spec for spec in tables.SPECS}
-        names: tuple[str, ...] = stage.spec["tables"]
+        names = cast(Experiment, stage.settings).tables
         for done, name in enumerate(names, 1):
-            if name not in specs:
-                raise RomnavError(f"unknown table {name}{suggest(name, specs)}")
             formats.write(tables.build(specs[name], bootstrap), stage.folder)
             progress(done, len(names), name)
         return {}
@@ -154,9 +173,12 @@ class Stages:
         from romnav.navigation.perception import LidarPerception
         from romnav.sensing import encoder as encoders
         from romnav.sensing.corruption import Corruption
-        from romnav.sensing.lidar import Lidar
 
-        lidar = Lidar([tile.solids for tile in world.tiles], world.spec.side, settings.lidar, self.device)
         corruption = Corruption(settings.pretrain.corruption, settings.pretrain.seed, self.device)
         frozen = encoders.load(encoder.folder / "encoder.pt", settings.pretrain.encoder, self.device)
-        return LidarPerception(lidar, corruption, frozen)
+        return LidarPerception(self._lidar(settings, world), corruption, frozen)
+
+    def _lidar(self, settings: Scale, world: World) -> Lidar:
+        from romnav.sensing.lidar import Lidar
+
+        return Lidar([tile.solids for tile in world.tiles], world.spec.side, settings.lidar, self.device)

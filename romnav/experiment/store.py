@@ -85,17 +85,18 @@ def _unchanged(above: Stage, record: Record) -> bool:
 
 
 def begin(stage: Stage, resume: bool) -> Record:
-    """Marks a stage as begun; drops what an earlier, different run of it left to be resumed.
+    """Marks a resumable stage as begun, and drops what a different run of it left to be resumed.
 
     Raises:
         RomnavError: Its folder cannot be written, which is better known before the work than after it.
     """
-    old = read(stage)
-    if not resume or old is None or old.key != stage.key:
-        for name in stage.scratch:
-            (stage.folder / name).unlink(missing_ok=True)
     record = Record(stage.key, stage.spec)
-    _write(stage, record)
+    if stage.scratch:
+        old = read(stage)
+        if not resume or old is None or old.key != stage.key:
+            for name in stage.scratch:
+                (stage.folder / name).unlink(missing_ok=True)
+        _write(stage, record)
     return record
 
 
