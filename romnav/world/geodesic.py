@@ -37,7 +37,7 @@ GOAL: int = 65535
 
 EAST, WEST, UP, DOWN = range(4)
 STEPS = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])
-"""(ix, iy) of the links. Rows run along iy, in which nodes are numbered consecutively."""
+"""(ix, iy) of the links: rows run along iy, in which nodes are numbered."""
 
 wp.config.quiet = True
 wp.set_module_options({"enable_backward": False})
@@ -45,18 +45,28 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Surface:
-    """Nodes of all tiles; corner k of a cell lies towards ``(2 * (k & 1) - 1, (k & 2) - 1)`` in (iy, ix)."""
+    """Nodes of all tiles, renumbered so that those of a run (joined along a row) follow each other.
+
+    Corner k of a cell lies towards ``(2 * (k & 1) - 1, (k & 2) - 1)`` in (iy, ix).
+    """
 
     xy: wp.array2d[wp.int32]
     """(M, 2) centre of each node, (iy, ix) in half cells."""
+    run: wp.array2d[wp.int32]
+    """(M, 2) first and last node of its run."""
     link: wp.array2d[wp.int32]
-    """(M, 4) adjacent nodes, -1 where occupied."""
+    """(M, 2) node above and below, -1 where occupied."""
+    joint: wp.array2d[wp.int32]
+    """(M, 2) last node of the run up to which the nodes above (below) form a run too; where there is none above
+    (below), the last such node."""
     corner: wp.array2d[wp.int32]
     """(M, 4) number, within the tile, of the occupied corner that the cell touches diagonally; -1 if none."""
     corner_node: wp.array[wp.int32]
     """(C,) node opposite to each corner."""
     corner_side: wp.array[wp.int32]
     """(C,) which corner of that node it is."""
+    original: wp.array[wp.int32]
+    """(M,) number within the tile that the tile's grids give to the node."""
     half: float
     """Half a cell, m."""
 
@@ -81,6 +91,8 @@ class Frontier:
 
     lit: wp.array2d[wp.float32]
     """Distance of each node of the tile from the goal, m."""
+    source: wp.array2d[wp.uint16]
+    """Source that lights it."""
     distance: wp.array2d[wp.float32]
     heading: wp.array2d[wp.vec2i]
     slot: wp.array2d[wp.int32]
@@ -147,22 +159,12 @@ def length(s: Surface, x: int, y: int):
 
 @wp.func
 def expand(
-    s: Surface,
-    f: Frontier,
-    sources: wp.array[wp.uint16],
-    base: wp.int64,
-    w: int,
-    first_node: int,
-    source: wp.uint16,
-    x: int,
-    start: float,
-    up: int,
-    cone: Cone,
+    s: Surface, f: Frontier, w: int, origin: int, source: int, x: int, start: float, cone: Cone, up: int
 ):
-    """Light the cells in a cone of a source at column ``x``, ``start`` metres from the goal; rows go ``up``."""
-    sign = 5 - 2 * up
-    over = 2 * (3 - up)
-    under = 2 - over
+    """Light what a source at column ``x``, ``start`` metres from the goal, sees in ``cone``; 0: rows go up, 1: down."""
+    sign = 1 - 2 * up
+    over = 2 - 2 * up
+    under = 2 * up
     room = f.cones.shape[1]
     f.cones[w, 0] = cone
     head = int(0)
@@ -172,74 +174,66 @@ def expand(
         head += 1
         middle = c.bottom + 1
         top = c.bottom + 2
-        n = c.node
-        left = s.xy[n, 0] - 1 - x
-        while left * c.ly > c.lx * top:
-            west = s.link[n, 1]
-            if west < 0:
-                break
-            n = west
-            left -= 2
-        first = int(-1)
-        lx = int(0)
-        ly = int(0)
-        while n >= 0:
-            centre = left + 1
-            right = left + 2
-            if left * c.ry >= c.rx * top and centre * c.ry > c.rx * middle:
-                break
-            if centre * c.ly >= c.lx * middle and centre * c.ry <= c.rx * middle:
-                distance = start + length(s, centre, middle)
-                if distance < f.lit[w, n - first_node]:
-                    f.lit[w, n - first_node] = distance
-                    sources[base + wp.int64(n - first_node)] = source
-            east = s.link[n, 0]
-            above = s.link[n, up]
-            if above >= 0 and right * c.ly > c.lx * top and left * c.ry < c.rx * top:
-                if first < 0:
-                    first = above
-                    lx = c.lx
-                    ly = c.ly
-                    if left * c.ly >= c.lx * top:
-                        lx = left
-                        ly = top
-                        if left > 0:
-                            relax(f, w, s.corner[n, over], start + length(s, left, top), left, sign * top)
-                        else:
-                            relax(
-                                f, w, s.corner[above, under], start + length(s, left, top), left, sign * top
-                            )
-                next = int(-1)
-                if east >= 0 and right * c.ry < c.rx * top:
-                    next = s.link[east, up]
-                if next < 0 or next != s.link[above, 0]:
-                    rx = c.rx
-                    ry = c.ry
-                    if right * c.ry <= c.rx * top:
-                        rx = right
-                        ry = top
-                        corner = s.corner[above, under + 1]
-                        if right < 0:
-                            corner = s.corner[n, over + 1]
-                        relax(f, w, corner, start + length(s, right, top), right, sign * top)
-                    if lx * ry < rx * ly:
-                        f.cones[w, tail % room] = Cone(first, top, lx, ly, rx, ry)
-                        tail += 1
-                    first = -1
-            n = east
-            left = right
+        begin = s.run[c.node, 0]
+        edge = s.xy[begin, 0] - 1 - x
+        cells = s.run[c.node, 1] - begin + 1
+        # cells of the run whose centre (lit), and whose upper border (passed), the cone meets
+        lit_from = int(0)
+        lit_to = int(cells)
+        passed_from = int(0)
+        passed_to = int(cells)
+        if c.ly > 0:
+            lit_from = wp.max(c.lx * middle - (edge - 1) * c.ly - 1, 0) / (2 * c.ly)
+            passed_from = wp.max(c.lx * top - edge * c.ly, 0) / (2 * c.ly)
+        if c.ry > 0:
+            lit_to = wp.min(wp.max(c.rx * middle - (edge - 1) * c.ry, 0) / (2 * c.ry), cells)
+            passed_to = wp.min(wp.max(c.rx * top - (edge - 2) * c.ry - 1, 0) / (2 * c.ry), cells)
+        for i in range(lit_from, lit_to):
+            distance = start + length(s, edge + 1 + 2 * i, middle)
+            n = begin - origin + i
+            if distance < f.lit[w, n]:
+                f.lit[w, n] = distance
+                f.source[w, n] = wp.uint16(source)
+        first = begin + passed_from
+        end = begin + passed_to
+        while first < end:
+            last = wp.min(s.joint[first, up], end - 1)
+            above = s.link[first, up]
+            if above >= 0:
+                lx = c.lx
+                ly = c.ly
+                left = edge + 2 * (first - begin)
+                if left * c.ly >= c.lx * top:
+                    lx = left
+                    ly = top
+                    corner = s.corner[above, under]
+                    if left > 0:
+                        corner = s.corner[first, over]
+                    relax(f, w, corner, start + length(s, left, top), left, sign * top)
+                rx = c.rx
+                ry = c.ry
+                right = edge + 2 * (last + 1 - begin)
+                if right * c.ry <= c.rx * top:
+                    rx = right
+                    ry = top
+                    corner = s.corner[above + last - first, under + 1]
+                    if right < 0:
+                        corner = s.corner[last, over + 1]
+                    relax(f, w, corner, start + length(s, right, top), right, sign * top)
+                if lx * ry < rx * ly:
+                    f.cones[w, tail % room] = Cone(above, top, lx, ly, rx, ry)
+                    tail += 1
+            first = last + 1
 
 
 @wp.func
-def follow(s: Surface, f: Frontier, w: int, node: int, start: float, step: int, side: int):
-    """Reach the corners along the border of the row of ``node``, where a path can bend away from the row."""
-    sign = 1 - 2 * step
-    n = s.link[node, step]
-    x = int(2)
-    while n >= 0:
-        relax(f, w, s.corner[n, side], start + length(s, x, 0), sign * x, 0)
-        n = s.link[n, step]
-        x += 2
+def follow(s: Surface, f: Frontier, w: int, begin: int, end: int, step: int, start: float, side: int):
+    """Reach the corners along the border of a row, from ``begin`` on, where a path can bend away from the row."""
+    n = begin + step
+    while step * (end - n) >= 0:
+        x = 2 * (n - begin)
+        relax(f, w, s.corner[n, side], start + length(s, x, 0), x, 0)
+        n += step
 
 
 @wp.kernel
@@ -255,18 +249,17 @@ def wavefront(
     first: int,
     workers: int,
     field: wp.array[wp.uint16],
-    sources: wp.array[wp.uint16],
+    source: wp.array[wp.uint16],
     reach: wp.array[wp.float32],
 ):
     """Goals ``first + tid``, ``first + tid + workers``, ... of ``tiles``, with the offsets of tiles and goals."""
     w = first + wp.tid()
     for g in range(w, goals.shape[0], workers):
         tile = tiles[g]
-        node_start = nodes[tile]
-        node_count = nodes[tile + 1] - node_start
+        origin = nodes[tile]
+        node_count = nodes[tile + 1] - origin
         offset = corners[tile]
         corner_count = corners[tile + 1] - offset
-        base = fields[g]
         for n in range(node_count):
             f.lit[w, n] = wp.inf
         for k in range(corner_count):
@@ -274,9 +267,8 @@ def wavefront(
             f.slot[w, k] = -1
         f.size[w] = 0
         goal = goals[g]
-        x = s.xy[goal, 0]
-        expand(s, f, sources, base, w, node_start, wp.uint16(65535), x, 0.0, 2, Cone(goal, -1, -1, 0, 1, 0))
-        expand(s, f, sources, base, w, node_start, wp.uint16(65535), x, 0.0, 3, Cone(goal, -1, -1, 0, 1, 0))
+        for up in range(2):
+            expand(s, f, w, origin, 65535, s.xy[goal, 0], 0.0, Cone(goal, -1, -1, 0, 1, 0), up)
         while f.size[w] > 0:
             k = nearest(f, w)
             node = s.corner_node[offset + k]
@@ -286,37 +278,32 @@ def wavefront(
             oy = (side & 2) - 1
             dx = f.heading[w, k][0]
             dy = f.heading[w, k][1]
-            # the path bends around the corner between its heading and the face of the occupied cell
-            up = int(2)
-            begin = int(node)
+            # the path bends around the corner, at most from its heading to the face of the occupied cell
             lx = dx
             ly = wp.abs(dy)
             rx = int(0)
             ry = int(1)
-            if dx * ox < 0 or dy * oy > 0:
-                if oy < 0:
-                    up = 3
-                begin = s.link[node, up]
-            else:
-                if oy > 0:
-                    up = 3
+            up = (1 - oy) / 2
+            begin = s.link[node, up]
+            if dx * ox >= 0 and dy * oy <= 0:
                 rx = ox
                 ry = 0
-                begin = s.link[node, (1 - ox) / 2]
+                up = 1 - up
+                begin = node + ox
             if lx * ry > rx * ly:
                 lx = rx
                 ly = ry
                 rx = dx
                 ry = wp.abs(dy)
-            cone = Cone(begin, 0, lx, ly, rx, ry)
-            expand(s, f, sources, base, w, node_start, wp.uint16(k), s.xy[node, 0] + ox, start, up, cone)
-            under = 2 * (up - 2)
+            expand(s, f, w, origin, k, s.xy[node, 0] + ox, start, Cone(begin, 0, lx, ly, rx, ry), up)
             if ry == 0:
-                follow(s, f, w, begin, start, 0, under)
+                follow(s, f, w, begin, s.run[begin, 1], 1, start, 2 * up)
             if ly == 0:
-                follow(s, f, w, begin, start, 1, under + 1)
+                follow(s, f, w, begin, s.run[begin, 0], -1, start, 2 * up + 1)
         for n in range(node_count):
-            field[base + wp.int64(n)] = wp.uint16(int(wp.min(f.lit[w, n] * 256.0 + 0.5, 65535.0)))
+            at = fields[g] + wp.int64(s.original[origin + n])
+            field[at] = wp.uint16(int(wp.min(f.lit[w, n] * 256.0 + 0.5, 65535.0)))
+            source[at] = f.source[w, n]
         for k in range(corner_count):
             reach[reaches[g] + wp.int64(k)] = f.distance[w, k]
 
@@ -352,7 +339,6 @@ def solve(
     surfaces = [_surface(g) for g in tiles]
     nodes = np.cumsum([0] + [len(p["xy"]) for p in surfaces])
     corners = np.cumsum([0] + [len(p["corner_node"]) for p in surfaces])
-    positions = [_corner_positions(p, g.cell) for p, g in zip(surfaces, tiles, strict=True)]
     counts = [len(g) for g in goals]
     tile = np.repeat(np.arange(len(tiles)), counts)
     field_offset = np.cumsum(np.concatenate([[0], np.diff(nodes)[tile]]))
@@ -361,11 +347,15 @@ def solve(
 
     s = Surface()
     s.half = tiles[0].cell / 2
-    for key, value in _pack(surfaces, nodes).items():
-        setattr(s, key, wp.array(value, dtype=wp.int32, device=device))
+    for key in surfaces[0]:
+        parts = [p[key] for p in surfaces]
+        if key in ("run", "link", "joint", "corner_node"):
+            parts = [np.where(part >= 0, part + n, -1) for part, n in zip(parts, nodes, strict=False)]
+        setattr(s, key, wp.array(np.concatenate(parts), dtype=wp.int32, device=device))
     shape = workers, int(np.diff(corners).max()) + 1
     f = Frontier()
     f.lit = wp.empty((workers, int(np.diff(nodes).max())), dtype=wp.float32, device=device)
+    f.source = wp.empty(f.lit.shape, dtype=wp.uint16, device=device)
     f.distance = wp.empty(shape, dtype=wp.float32, device=device)
     f.heading = wp.empty(shape, dtype=wp.vec2i, device=device)
     f.slot = wp.empty(shape, dtype=wp.int32, device=device)
@@ -376,8 +366,12 @@ def solve(
     field = wp.empty(int(field_offset[-1]), dtype=wp.uint16, device=device)
     source = wp.empty(int(field_offset[-1]), dtype=wp.uint16, device=device)
     reach = wp.empty(int(reach_offset[-1]), dtype=wp.float32, device=device)
-    start = np.concatenate([np.asarray(g) + n for g, n in zip(goals, nodes, strict=False)])
-    inputs = [s, f, *(wp.array(a, dtype=wp.int32, device=device) for a in (start, tile, nodes, corners))]
+    start = [np.argsort(p["original"])[g] + n for p, g, n in zip(surfaces, goals, nodes, strict=False)]
+    inputs = [
+        s,
+        f,
+        *(wp.array(a, dtype=wp.int32, device=device) for a in (np.concatenate(start), tile, nodes, corners)),
+    ]
     inputs += [wp.array(a, dtype=wp.int64, device=device) for a in (field_offset[:-1], reach_offset[:-1])]
 
     def run(first: int, count: int) -> None:
@@ -391,10 +385,10 @@ def solve(
         run(0, workers)
     ends = np.cumsum(counts)[:-1]
     return [
-        Geodesics(*(part.reshape(count, -1) for part in parts), corner)
-        for count, corner, *parts in zip(
+        Geodesics(*(part.reshape(count, -1) for part in parts), _corner_positions(surface) * s.half)
+        for count, surface, *parts in zip(
             counts,
-            positions,
+            surfaces,
             np.split(field.numpy(), field_offset[ends]),
             np.split(source.numpy(), field_offset[ends]),
             np.split(reach.numpy(), reach_offset[ends]),
@@ -403,50 +397,69 @@ def solve(
     ]
 
 
-def _pack(
-    surfaces: Sequence[dict[str, NDArray[np.int32]]], nodes: NDArray[np.intp]
-) -> dict[str, NDArray[np.int32]]:
-    """Arrays of `Surface` with the nodes of all tiles numbered through."""
-    shifted = [
-        {**p, "link": np.where(p["link"] >= 0, p["link"] + n, -1), "corner_node": p["corner_node"] + n}
-        for p, n in zip(surfaces, nodes, strict=False)
-    ]
-    return {key: np.concatenate([p[key] for p in shifted]) for key in surfaces[0]}
-
-
-def _corner_positions(surface: dict[str, NDArray[np.int32]], cell: float) -> NDArray[np.float32]:
-    side = surface["corner_side"]
-    yx = surface["xy"][surface["corner_node"]] + np.stack([2 * (side & 1) - 1, (side & 2) - 1], axis=1)
-    return (yx[:, ::-1] * (cell / 2)).astype(np.float32)
+def _links(grids: Grids) -> NDArray[np.int32]:
+    """(M, 4) adjacent node of each node, in the order of `STEPS`; -1 where occupied."""
+    layer, ix, iy = grids._index()
+    padded = np.pad(grids.node, ((0, 0), (1, 1), (1, 1)), constant_values=-1)
+    link = np.stack([padded[layer, ix + 1 + dx, iy + 1 + dy] for dx, dy in STEPS], axis=1)
+    for k, back in ((EAST, WEST), (WEST, EAST), (UP, DOWN), (DOWN, UP)):
+        link[link[link[:, k], back] != np.arange(len(link)), k] = -1
+    return link
 
 
 def _surface(grids: Grids) -> dict[str, NDArray[np.int32]]:
     """Arrays of `Surface` for one tile."""
-    layer, ix, iy = grids._index()
-    count = len(layer)
-    padded = np.pad(grids.node, ((0, 0), (1, 1), (1, 1)), constant_values=-1)
-    link = np.stack([padded[layer, ix + 1 + dx, iy + 1 + dy] for dx, dy in STEPS], axis=1)
-    for k, back in ((0, 1), (1, 0), (2, 3), (3, 2)):
-        link[link[link[:, k], back] != np.arange(count), k] = -1
-    corner = np.full((count, 4), -1, np.int32)
+    _, ix, iy = grids._index()
+    link = _links(grids)
+    first = np.where(link[:, WEST] >= 0, link[:, WEST], np.arange(len(link)))
+    while (first != first[first]).any():
+        first = first[first]
+    original = np.lexsort((iy, first))
+    number = np.append(np.argsort(original), -1)
+    link = number[link[original]]
+    nodes = np.arange(len(link))
+    above = link[:, UP:]
+
+    corner = np.full((len(link), 4), -1)
     for k in range(4):
         across, along = (EAST if k & 1 else WEST), (UP if k & 2 else DOWN)
         a, b = link[:, across], link[:, along]
         corner[(a >= 0) & (b >= 0) & (link[a, along] < 0) & (link[b, across] < 0), k] = 0
     node, side = np.nonzero(corner == 0)
     corner[node, side] = np.arange(len(node))
+
+    east = link[:-1, EAST] >= 0
+    free = above >= 0
+    beside = np.where(free[:-1], link[above[:-1], EAST], -1)
+    joint = east[:, None] & (free[1:] == free[:-1]) & (beside == above[1:])
     return {
-        "xy": np.stack([2 * iy + 1, 2 * ix + 1], axis=1).astype(np.int32),
-        "link": link.astype(np.int32),
+        "xy": np.stack([2 * iy + 1, 2 * ix + 1], axis=1)[original],
+        "run": np.stack([number[first[original]], _stretch(east)], axis=1),
+        "link": above,
+        "joint": np.stack([_stretch(joint[:, 0]), _stretch(joint[:, 1])], axis=1),
         "corner": corner,
-        "corner_node": node.astype(np.int32),
-        "corner_side": side.astype(np.int32),
+        "corner_node": node,
+        "corner_side": side,
+        "original": original,
     }
+
+
+def _stretch(joined: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """(M,) last element of the stretch of each of M elements; ``joined`` (M - 1,): belongs to the next one's."""
+    ends = np.flatnonzero(~np.append(joined, False))
+    return ends[np.searchsorted(ends, np.arange(len(joined) + 1))]
+
+
+def _corner_positions(surface: dict[str, NDArray[np.int32]]) -> NDArray[np.float32]:
+    """(C, 2) x and y of the corners, half cells."""
+    side = surface["corner_side"]
+    yx = surface["xy"][surface["corner_node"]] + np.stack([2 * (side & 1) - 1, (side & 2) - 1], axis=1)
+    return yx[:, ::-1].astype(np.float32)
 
 
 @wp.struct
 class Paths:
-    """`Geodesics` of all tiles, end to end, with the offsets of each goal."""
+    """`Geodesics` of all tiles, end to end, with the offsets of each goal, and the nodes of all tiles."""
 
     source: wp.array[wp.uint16]
     source_offset: wp.array[wp.int64]
@@ -455,6 +468,9 @@ class Paths:
     corner: wp.array[wp.vec2]
     corner_offset: wp.array[wp.int64]
     goal: wp.array[wp.vec2]
+    position: wp.array[wp.vec2]
+    link: wp.array2d[wp.int32]
+    cell: float
 
 
 @wp.func
@@ -469,7 +485,6 @@ def bend(paths: Paths, goal: wp.int64, node: wp.int64):
 
 @wp.kernel
 def look(
-    s: Surface,
     paths: Paths,
     at: wp.array[wp.int64],
     position: wp.array[wp.vec2],
@@ -485,22 +500,22 @@ def look(
         return
     p = position[e]
     g = goals[e]
-    offset = p - s.half * wp.vec2(float(s.xy[node, 1]), float(s.xy[node, 0]))
+    offset = (p - paths.position[node]) / paths.cell
     along = 2
     if offset[0] < 0.0:
         along = 3
     across = 0
     if offset[1] < 0.0:
         across = 1
-    a = s.link[node, along]
-    b = s.link[node, across]
+    a = paths.link[node, along]
+    b = paths.link[node, across]
     diagonal = int(-1)
     if a >= 0:
-        diagonal = s.link[a, across]
+        diagonal = paths.link[a, across]
     if diagonal < 0 and b >= 0:
-        diagonal = s.link[b, along]
-    u = wp.min(wp.abs(offset[0]) / (2.0 * s.half), 0.5)
-    v = wp.min(wp.abs(offset[1]) / (2.0 * s.half), 0.5)
+        diagonal = paths.link[b, along]
+    u = wp.min(wp.abs(offset[0]), 0.5)
+    v = wp.min(wp.abs(offset[1]), 0.5)
     total = float(0.0)
     weights = float(0.0)
     for k in range(4):
@@ -537,15 +552,13 @@ class GeodesicLookup:
         tile = torch.repeat_interleave(torch.arange(len(world.grids)), goals.diff().cpu())
         local = (world.goal - nodes[tile]).cpu().numpy()
         solved = solve(world.grids, np.split(local, goals[1:-1].cpu().numpy()))
-        surfaces = [_surface(g) for g in world.grids]
-        device = str(world.node.device)
-        self._surface = Surface()
-        self._surface.half = world.cell / 2
-        for key, value in _pack(surfaces, nodes.cpu().numpy()).items():
-            setattr(self._surface, key, wp.array(value, dtype=wp.int32, device=device))
+        links = [_links(g) for g in world.grids]
+        links = [np.where(link >= 0, link + n, -1) for link, n in zip(links, nodes.tolist(), strict=False)]
         corners = np.cumsum([0] + [len(p.corner) for p in solved])
         count = np.diff(corners)[tile]
+        position = world.position[:, :2].cpu().numpy()
         self._paths = Paths()
+        self._paths.cell = world.cell
         for key, value, kind in (
             ("source", np.concatenate([p.source.ravel() for p in solved]), wp.uint16),
             ("source_offset", (world.field_start - nodes[tile]).cpu().numpy(), wp.int64),
@@ -553,9 +566,11 @@ class GeodesicLookup:
             ("reach_offset", np.cumsum(count) - count, wp.int64),
             ("corner", np.concatenate([p.corner for p in solved]), wp.vec2),
             ("corner_offset", corners[tile], wp.int64),
-            ("goal", world.position[world.goal, :2].cpu().numpy(), wp.vec2),
+            ("goal", position[world.goal.cpu().numpy()], wp.vec2),
+            ("position", position, wp.vec2),
+            ("link", np.concatenate(links), wp.int32),
         ):
-            setattr(self._paths, key, wp.array(value, dtype=kind, device=device))
+            setattr(self._paths, key, wp.array(value, dtype=kind, device=str(world.node.device)))
 
     def __call__(self, tile: Tensor, layer: Tensor, xy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Planar distance (E,), m, and unit direction (E, 2) of the shortest path to goals (E,).
@@ -570,7 +585,6 @@ class GeodesicLookup:
             look,
             len(xy),
             [
-                self._surface,
                 self._paths,
                 wp.from_torch(node),
                 wp.from_torch(xy.contiguous(), dtype=wp.vec2),
