@@ -84,9 +84,9 @@ def execute(
     for stage in stages:
         changed = "; ".join(store.differences(stage))
         say(f"{stage.name} (changed: {changed})" if changed else stage.name)
-        record = store.begin(stage, resume)
         started = time.monotonic()
         try:
+            record = store.begin(stage, resume)
             with bar(stage.name) as progress:
                 facts = actions[stage.kind](stage, progress)
         except OSError as error:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def read(stage: Stage) -> Record | None:
     """
     try:
         return Record(**json.loads(stage.record.read_text("utf-8")))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, TypeError) as error:
         raise RomnavError(
@@ -75,13 +76,18 @@ def finished(stage: Stage) -> bool:
                 f"{stage.folder / name}: not the file that {stage.record.name} recorded (truncated, edited); "
                 "restore it, or delete it to run the stage again"
             )
-    return all(_unchanged(above, record) for above in stage.upstream)
+    return _read_what_is_there(stage, record)
 
 
-def _unchanged(above: Stage, record: Record) -> bool:
-    """Whether a stage upstream still has the output that was read; its files may be gone."""
-    upstream = read(above)
-    return upstream is None or not upstream.outputs or upstream.outputs == record.upstream.get(above.name)
+def _read_what_is_there(stage: Stage, record: Record) -> bool:
+    """Whether the upstream outputs are those that were read; records tell, the files may be gone."""
+    for above in stage.upstream:
+        other = read(above)
+        if other is None or not other.outputs:
+            continue
+        if other.outputs != record.upstream.get(above.name) or not _read_what_is_there(above, other):
+            return False
+    return True
 
 
 def begin(stage: Stage, resume: bool) -> Record:
@@ -94,8 +100,9 @@ def begin(stage: Stage, resume: bool) -> Record:
     if stage.scratch:
         old = read(stage)
         if not resume or old is None or old.key != stage.key:
-            for name in stage.scratch:
-                (stage.folder / name).unlink(missing_ok=True)
+            for path in (stage.folder / name for name in stage.scratch):
+                if path.exists():
+                    path.unlink()
         _write(stage, record)
     return record
 
@@ -137,15 +144,19 @@ def _flat(data: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def provenance() -> dict[str, Any]:
-    """Commit, versions and machine of this process."""
+    """Commit, versions, machine and command of this process, and the time."""
+    command = shlex.join(["romnav", *sys.argv[1:]])
+    return {**_process(), "command": command, "finished": datetime.now(UTC).isoformat(timespec="seconds")}
+
+
+@cache
+def _process() -> dict[str, Any]:
     return {
         "commit": commit(),
         "romnav": __version__,
         "python": platform.python_version(),
         **{name: _version(name) for name in _PACKAGES},
         "machine": f"{_processor()}, {os.cpu_count()} threads, {platform.system()} {platform.release()}",
-        "command": shlex.join(["romnav", *sys.argv[1:]]),
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from romnav.config import Config
+from romnav.errors import RomnavError
+from romnav.experiment.project import Project
+from romnav.experiment.scales import ScaleFile
+from romnav.experiment.spec import Experiment, load_experiments, parse, suggest
+
+ROOT = Path(__file__).parents[2]
+EXPERIMENT = """
+kind = "ablation"
+title = "t"
+tables = ["a"]
+[arms.rom]
+label = "RoM"
+[arms.slow]
+label = "Slow"
+navigation.env.command.forward = 0.5
+"""
+
+
+class Inner(Config):
+    width: int = 1
+    span: tuple[float, float] = (0.0, 1.0)
+
+
+class Outer(Config):
+    inner: Inner = Inner()
+    optional: Inner | None = None
+    rate: float = 1.0
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"inner": {"widht": 2}}, "f.toml: unknown key inner.widht; did you mean width?"),
+        ({"optional": {"spam": 2}}, "f.toml: unknown key optional.spam; did you mean span?"),
+        ({"raet": 2.0}, "f.toml: unknown key raet; did you mean rate?"),
+        ({"zzz": 2.0}, "f.toml: unknown key zzz; there are inner, optional, rate"),
+        ({"rate": "fast"}, "f.toml: key rate: input should be a valid number, not 'fast'"),
+        ({"rate": "1.5"}, "f.toml: key rate: input should be a valid number, not '1.5'"),
+        ({"inner": {"width": 1.5}}, "f.toml: key inner.width: input should be a valid integer"),
+        ({"inner": {"span": [0, "x"]}}, "f.toml: key inner.span.1: input should be a valid number, not 'x'"),
+        ({"inner": 3}, "f.toml: key inner: input should be an object, not 3"),
+    ],
+)
+def test_an_error_names_file_key_and_nearest_name(data: dict, message: str) -> None:
+    with pytest.raises(RomnavError) as error:
+        parse(Outer, data, Path("f.toml"))
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def test_toml_arrays_and_integers_become_tuples_and_floats() -> None:
+    outer = parse(Outer, {"rate": 2, "inner": {"span": [1, 2]}}, Path("f.toml"))
+    assert outer.rate == 2.0
+    assert outer.inner.span == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("kind = ", "not valid TOML: Invalid value (at end of document)"),
+        (EXPERIMENT.replace('title = "t"\n', ""), "key title is missing"),
+        (EXPERIMENT.replace("ablation", "ablatoin"), "key kind: input should be 'ablation', not 'ablatoin'"),
+        (EXPERIMENT.replace("arms.slow", "arms.oracle"), "arms: oracle cannot be the name of a trained arm"),
+        (EXPERIMENT.replace('label = "RoM"', ""), "key arms.rom.label is missing"),
+    ],
+)
+def test_an_invalid_experiment_is_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "e.toml"
+    file.write_text(text)
+    with pytest.raises(RomnavError) as error:
+        load_experiments(tmp_path)
+    assert str(error.value) == f"{file}: {message}"
+
+
+def test_an_arm_of_two_experiments_is_the_same_arm(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(EXPERIMENT)
+    (tmp_path / "b.toml").write_text(EXPERIMENT.replace('"Slow"', '"Slower label"'))
+    assert set(load_experiments(tmp_path)) == {"a", "b"}
+    (tmp_path / "b.toml").write_text(EXPERIMENT.replace("0.5", "0.6"))
+    with pytest.raises(RomnavError, match=r"a\.toml and b\.toml differ in what arm slow is"):
+        load_experiments(tmp_path)
+
+
+def test_suggest_lists_all_names_where_none_is_near() -> None:
+    assert suggest("x", []) == "; there are none"
+    assert suggest("smok", ["cpu", "smoke"]) == "; did you mean smoke?"
+
+
+@pytest.fixture
+def scales(tmp_path: Path) -> Path:
+    (tmp_path / "smoke.toml").write_text("[lidar]\nrows = 15\n[navigation.env]\nenvs = 8\nduration = 20.0\n")
+    return tmp_path
+
+
+def test_an_arm_changes_only_what_it_names(scales: Path) -> None:
+    scale = ScaleFile(scales, "smoke")
+    arm = parse(Experiment, tomllib.loads(EXPERIMENT), Path("e.toml")).arms["slow"]
+    changed = scale.changed("slow", arm, Path("e.toml"))
+    assert changed.navigation.env.command.forward == 0.5
+    assert changed.navigation.env.envs == 8
+    expected = scale.settings.model_dump()
+    expected["navigation"]["env"]["command"]["forward"] = 0.5
+    assert changed.model_dump() == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("navigation.env.envz = 3", "unknown key arms.slow.navigation.env.envz; did you mean envs?"),
+        ("navigaton.env.envs = 3", "unknown key arms.slow.navigaton; did you mean navigation?"),
+        ('navigation.env.envs = "3"', "key arms.slow.navigation.env.envs: input should be a valid integer"),
+        ("navigation = 3", "key arms.slow.navigation: input should be an object, not 3"),
+        ("evaluation.duration = 60.0", "arms.slow.evaluation: set it in the scale, all arms share it"),
+    ],
+)
+def test_a_wrong_change_names_the_experiment_file(scales: Path, change: str, message: str) -> None:
+    text = EXPERIMENT.replace("navigation.env.command.forward = 0.5", change)
+    arm = parse(Experiment, tomllib.loads(text), Path("e.toml")).arms["slow"]
+    with pytest.raises(RomnavError) as error:
+        ScaleFile(scales, "smoke").changed("slow", arm, Path("e.toml"))
+    assert str(error.value).startswith(f"e.toml: {message}")
+
+
+def test_an_unknown_scale_names_the_nearest(scales: Path) -> None:
+    with pytest.raises(RomnavError, match="unknown scale smok; did you mean smoke"):
+        ScaleFile(scales, "smok")
+
+
+def test_the_projects_own_experiments_are_valid_at_every_scale() -> None:
+    project = Project(ROOT, ROOT / "results")
+    files = sorted((ROOT / "experiments" / "scales").glob("*.toml"))
+    assert {file.stem for file in files} == {"smoke", "cpu", "paper"}
+    for file in files:
+        scale = ScaleFile(file.parent, file.stem)
+        for name, experiment in project.experiments.items():
+            assert [scale.changed(arm, spec, project.file(name)) for arm, spec in experiment.arms.items()]
