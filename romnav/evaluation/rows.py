@@ -205,8 +205,7 @@ def read(path: Path) -> EpisodeRows:
     except ValidationError as error:
         key = ".".join(str(part) for part in error.errors()[0]["loc"])
         raise RomnavError(f"{path}: provenance key {key}: {error.errors()[0]['msg']}; {again}") from error
-    columns = {name: table[name].to_numpy() for name in table.column_names}
-    return make(columns, provenance, str(path))
+    return make(table.to_pydict(), provenance, str(path))  # to_numpy would import pandas
 
 
 def pair(runs: Iterable[EpisodeRows]) -> list[Arm]:

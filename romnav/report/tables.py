@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -236,7 +237,7 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     trained = [arm for arm in shown if any(run.provenance.steps for run in arm.runs)]
     facts = {
         "scale": _list(run.provenance.scale for run in runs),
-        "commit": _list(run.provenance.commit[:12] for run in runs),
+        "commit": _list(re.sub(r"(?<=^\w{12})\w+", "", run.provenance.commit) for run in runs),
         "episode_set": runs[0].provenance.episode_set,
     }
     steps = _list(f"{run.provenance.steps / 1e6:.3g} M" for arm in trained for run in arm.runs)

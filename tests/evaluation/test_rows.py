@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,17 @@ def test_written_rows_are_read_back(episode_rows, tmp_path: Path) -> None:
         np.testing.assert_array_equal(read.columns[name], made.columns[name])
     assert pq.read_schema(path).remove_metadata() == rows.SCHEMA
     assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_reading_does_not_import_pandas(episode_rows, tmp_path: Path) -> None:
+    path = tmp_path / "rows"
+    rows.write(path, episode_rows())
+    script = (
+        "import sys; from pathlib import Path; from romnav.report import results, tables; "
+        f"results.rows.read(Path({str(path)!r})); "
+        "sys.exit(bool({'pandas', 'torch', 'warp', 'mujoco'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
 
 
 def test_equal_rows_give_equal_files(episode_rows, tmp_path: Path) -> None:

@@ -31,7 +31,14 @@ SKILLS = {
 def arms(episode_rows) -> list[rows.Arm]:
     steps = {"oracle": 0, "straight": 0}
     return rows.pair(
-        episode_rows(arm, skill, n=256, steps=steps.get(arm, 1_500_000), scale="cpu_&_%")
+        episode_rows(
+            arm,
+            skill,
+            n=256,
+            steps=steps.get(arm, 1_500_000),
+            scale="cpu_&_%",
+            commit=f"{'0123456789' * 4}-dirty",
+        )
         for arm, skill in SKILLS.items()
     )
 
@@ -146,7 +153,7 @@ def test_levels_table(built, arms) -> None:
 def test_the_caption_names_scale_commit_and_episode_set(built) -> None:
     for table in built.values():
         assert "cpu_&_% scale" in table.caption
-        assert "commit 0123456789ab" in table.caption
+        assert "commit 012345678901-dirty." in table.caption
         assert "256 paired episodes of set feedc0ffee12" in table.caption
         assert "% episode_set: feedc0ffee123456\n" in formats.latex(table)
 
@@ -189,7 +196,7 @@ def test_no_table_without_its_reference_arm(episode_rows) -> None:
 
 def test_a_table_needs_one_of_its_arms(episode_rows) -> None:
     bootstrap = Bootstrap(rows.pair([episode_rows("uniform")]))
-    with pytest.raises(RomnavError, match="table nav-levels: no arm .* evaluate rom-nav first"):
+    with pytest.raises(RomnavError, match=r"table nav-levels: no arm .* evaluate rom-nav first"):
         tables.build(tables.SPECS[3], bootstrap)
     lone = tables.build(tables.SPECS[1], bootstrap)  # the reference is missing: nothing to subtract from
     assert {cell.text for r in lone.blocks[0].rows for cell in r.cells} == {"–"}
