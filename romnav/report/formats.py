@@ -6,8 +6,8 @@ import csv
 import io
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from romnav import files
@@ -15,31 +15,22 @@ from romnav import files
 
 @dataclass(frozen=True)
 class Cell:
-    """A number in a table, as it is shown, with its interval and the episodes behind it; NaN is a dash."""
+    """A number in a table and as it is shown (NaN is a dash); facts behind it go to the CSV alone."""
 
     value: float
     text: str
-    lo: float = math.nan
-    hi: float = math.nan
-    n: int | None = None
+    facts: Mapping[str, float | None] = field(default_factory=dict)
     bold: bool = False
     dagger: bool = False
 
 
 def number(
-    value: float,
-    decimals: int,
-    *,
-    sign: bool = False,
-    lo: float = math.nan,
-    hi: float = math.nan,
-    n: int | None = None,
-    dagger: bool = False,
+    value: float, decimals: int, *, sign: bool = False, dagger: bool = False, **facts: float | None
 ) -> Cell:
     """A cell that shows a value rounded to some decimals, without negative zero."""
     shown = round(value, decimals) + 0.0
     text = f"{shown:{'+' if sign else ''}.{decimals}f}" if math.isfinite(value) else "–"
-    return Cell(value, text, lo, hi, n, dagger=dagger)
+    return Cell(value, text, facts, dagger=dagger)
 
 
 @dataclass(frozen=True)
@@ -175,9 +166,12 @@ def _md_line(row: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """One line per number, unrounded, with its interval and provenance; empty where there is none."""
+    """One line per number, unrounded, with its facts and provenance; empty where there are none."""
     text = io.StringIO()
-    head = ["table", "source", "row", "column", "value", "lo", "hi", "n", "bold", "dagger", *table.provenance]
+    facts = dict.fromkeys(
+        f for block in table.blocks for row in block.rows for c in row.cells for f in c.facts
+    )
+    head = ["table", "source", "row", "column", "value", *facts, "bold", "dagger", *table.provenance]
     out = csv.DictWriter(text, head, lineterminator="\n")
     out.writeheader()
     for block in table.blocks:
@@ -186,9 +180,9 @@ def to_csv(table: Table) -> str:
             origin |= table.provenance
         for row in block.rows:
             for column, cell in zip(table.columns, row.cells, strict=True):
-                values = {"value": cell.value, "lo": cell.lo, "hi": cell.hi}
-                line = {name: x for name, x in values.items() if math.isfinite(x)}
-                marks = {"n": cell.n, "bold": int(cell.bold), "dagger": int(cell.dagger)}
+                known = {"value": cell.value, **cell.facts}
+                line = {name: x for name, x in known.items() if x is not None and math.isfinite(x)}
+                marks = {"bold": int(cell.bold), "dagger": int(cell.dagger)}
                 out.writerow({**origin, "row": row.label, "column": column, **line, **marks})
     return text.getvalue()
 

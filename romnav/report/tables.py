@@ -207,7 +207,8 @@ def _levels(spec: LevelsSpec, bootstrap: Bootstrap) -> tuple[_Blocks, _Blocks]:
         if not {spec.reference.arm, arm} <= set(bootstrap.arms):
             return number(math.nan, 1)
         c = bootstrap.contrast(spec.reference.arm, arm, horizon, level)
-        return number(c.diff, 1, sign=True, lo=c.lo, hi=c.hi, n=c.n, dagger=c.significant)
+        facts = {"lo": c.lo, "hi": c.hi, "n": c.n, "a_only": c.a_only, "b_only": c.b_only, "mid_p": c.mid_p}
+        return number(c.diff, 1, sign=True, dagger=c.significant, **facts)
 
     def published(arm: str, horizon: int, level: Level) -> Cell:
         diff, significant = paper.CONTRASTS[spec.reference.arm, arm][horizon, level]

@@ -177,6 +177,7 @@ def test_csv_holds_unrounded_numbers_with_intervals(built, arms) -> None:
     c = Bootstrap(arms).contrast("rom", "uniform", 120, "cross")
     assert (float(line["value"]), float(line["lo"]), float(line["hi"])) == (c.diff, c.lo, c.hi)
     assert (int(line["n"]), bool(int(line["dagger"]))) == (c.n, c.significant)
+    assert (int(line["a_only"]), int(line["b_only"]), float(line["mid_p"])) == (c.a_only, c.b_only, c.mid_p)
     assert (line["scale"], line["episode_set"]) == ("cpu_&_%", "feedc0ffee123456")
     published = [x for x in lines if x["source"] == "paper"]
     assert len(published) == 12
