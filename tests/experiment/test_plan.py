@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from romnav.errors import RomnavError
+from romnav.experiment.plan import Plan, Stage
+from romnav.experiment.project import Project
+from romnav.experiment.scales import ScaleFile
+
+ROOT = Path(__file__).parents[2]
+SCALE = """
+[world]
+tiles = 4
+[lidar]
+rows = 15
+"""
+
+
+def plan(root: Path, scale: str = SCALE) -> Plan:
+    folder = root / "experiments" / "scales"
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(ROOT / "experiments" / "spawn-goal.toml", root / "experiments")
+    (folder / "tiny.toml").write_text(scale)
+    return Plan(Project(root, root / "results"), ScaleFile(folder, "tiny"))
+
+
+def everything(tables: Stage) -> dict[str, str]:
+    """Key of each stage by name."""
+    keys = {tables.name: tables.key}
+    for stage in tables.upstream:
+        keys |= everything(stage)
+    return keys
+
+
+EVALUATED = {f"episodes {arm}, seed 0" for arm in ("rom", "uniform", "nocap", "uniform-nocap")}
+SCRIPTED = {"episodes oracle, seed 0", "episodes straight, seed 0"}
+TRAINED = {name.replace("episodes", "policy") for name in EVALUATED}
+TABLES = {"tables spawn-goal"}
+
+
+@pytest.mark.parametrize(
+    ("section", "change", "rerun"),
+    [
+        ("world", "tiles = 5", {"encoder lidar"} | TRAINED | EVALUATED | TABLES),
+        ("lidar", "rows = 20", {"encoder lidar"} | TRAINED | EVALUATED | TABLES),
+        ("pretrain", "epochs = 3", {"encoder lidar"} | TRAINED | EVALUATED | TABLES),
+        ("navigation.ppo", "gamma = 0.9", TRAINED | EVALUATED | TABLES),
+        ("navigation.policy", "recurrent = 64", TRAINED | EVALUATED | TABLES),
+        ("navigation.env", "period = 0.1", TRAINED | EVALUATED | SCRIPTED | TABLES),
+        ("evaluation", "reach = 0.4", EVALUATED | SCRIPTED | TABLES),
+    ],
+)
+def test_a_setting_reruns_exactly_what_depends_on_it(
+    tmp_path: Path, section: str, change: str, rerun: set[str]
+) -> None:
+    before = everything(plan(tmp_path).tables("spawn-goal", [0]))
+    name = change.split(" = ")[0]
+    kept = "\n".join(line for line in SCALE.splitlines() if not line.startswith(name))
+    kept = kept.replace(f"[{section}]", "") if name in SCALE else kept
+    after = everything(plan(tmp_path, f"{kept}\n[{section}]\n{change}\n").tables("spawn-goal", [0]))
+    assert before.keys() == after.keys()
+    assert {name for name in before if before[name] != after[name]} == rerun
+
+
+def test_the_arms_share_one_encoder(tmp_path: Path) -> None:
+    keys = everything(plan(tmp_path).tables("spawn-goal", [0]))
+    assert len(keys) == 1 + 4 + 4 + 2 + 1
+    assert len({keys[name] for name in TRAINED}) == 4
+
+
+def test_an_arm_that_changes_the_encoder_gets_its_own(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    here.project.file("more").write_text(
+        'kind = "ablation"\ntitle = "t"\ntables = []\n[arms.fine]\nlabel = "Fine"\nlidar.rows = 30\n'
+    )
+    own = here.policy("fine", 0).upstream[0]
+    assert own.folder != here.policy("rom", 0).upstream[0].folder
+    assert own.folder.parent == here.encoder().folder.parent
+
+
+def test_seeds_are_trained_apart_and_share_the_scripted_arms(tmp_path: Path) -> None:
+    names = everything(plan(tmp_path).tables("spawn-goal", [0, 1])).keys()
+    assert {"policy rom, seed 0", "policy rom, seed 1"} <= names
+    assert "episodes oracle, seed 1" not in names
+
+
+def test_unknown_names_are_one_clear_error(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    with pytest.raises(RomnavError, match="unknown experiment spawn-gaol; did you mean spawn-goal"):
+        here.tables("spawn-gaol", [0])
+    with pytest.raises(RomnavError, match="unknown arm unifrom; did you mean uniform"):
+        here.episodes("unifrom", 0)
+    text = here.project.file("spawn-goal").read_text()
+    here.project.file("spawn-goal").write_text(text.replace("spawngoal-perf-rom", "spawngoal-prf-rom"))
+    fresh = Plan(Project(tmp_path, tmp_path / "results"), here.scale)
+    with pytest.raises(RomnavError, match="unknown table spawngoal-prf-rom; did you mean spawngoal-perf-rom"):
+        fresh.tables("spawn-goal", [0])
