@@ -82,7 +82,9 @@ def rasterise(tile: Tile, spec: GridSpec) -> Grids:
     for layer in range(layers):
         for s in np.flatnonzero(_on_layer(tile.solids, layer)):
             window, u, _, inside = _footprint(tile.solids, int(s), centres, 0.0)
-            z = tile.solids.top[s] + tile.solids.slope_top[s] * u
+            z = tile.solids.top[s] + tile.solids.slope_top[s] * np.clip(
+                u, -tile.solids.half[s, 0], tile.solids.half[s, 0]
+            )
             h, top = height[layer][window], surface[layer][window]
             higher = (inside <= 0.0) & ~(z <= h)
             h[higher], top[higher] = z[higher], s
@@ -100,7 +102,7 @@ def _on_layer(solids: Solids, layer: int) -> NDArray[np.bool_]:
 def _footprint(
     solids: Solids, s: int, centres: NDArray[np.float64], margin: float
 ) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Window of cells within ``margin`` of solid ``s``: (slices, u clamped to the solid, v, distance to it)."""
+    """Window of cells within ``margin`` of solid ``s``: (slices, u, v, distance to it)."""
     half, yaw = solids.half[s], solids.yaw[s]
     c, sn = np.cos(yaw), np.sin(yaw)
     if solids.shape[s] == Shape.BOX:
@@ -115,10 +117,12 @@ def _footprint(
     u, v = c * dx + sn * dy, c * dy - sn * dx
     if solids.shape[s] == Shape.BOX:
         # half a micrometre of slack: a cell centre on the seam of two slabs belongs to one of them
-        distance = np.hypot(np.maximum(np.abs(u) - half[0] - 5e-7, 0), np.maximum(np.abs(v) - half[1] - 5e-7, 0))
+        distance = np.hypot(
+            np.maximum(np.abs(u) - half[0] - 5e-7, 0), np.maximum(np.abs(v) - half[1] - 5e-7, 0)
+        )
     else:
         distance = np.maximum(np.hypot(u, v) - half[0], 0)
-    return window, np.clip(u, -half[0], half[0]), v, distance
+    return window, u, v, distance
 
 
 def _blocked_by_solids(
@@ -136,8 +140,11 @@ def _blocked_by_solids(
     for s in map(int, np.flatnonzero(relevant)):
         window, u, _, distance = _footprint(solids, s, centres, spec.robot_radius)
         h, below = height[window], surface[window]
-        bottom = solids.bottom[s] + solids.slope_bottom[s] * u
-        top = solids.top[s] + solids.slope_top[s] * u
+        half, reach = solids.half[s, 0], spec.robot_radius
+        # inclined lids count where they reach furthest towards the robot, anywhere within its radius
+        lean, lean_top = solids.slope_bottom[s], solids.slope_top[s]
+        bottom = solids.bottom[s] + lean * np.clip(u - np.sign(lean) * reach, -half, half)
+        top = solids.top[s] + lean_top * np.clip(u + np.sign(lean_top) * reach, -half, half)
         near = (distance < spec.robot_radius) & (bottom < h + spec.robot_height)
         if solids.layers[s, 0] < 0:
             blocked[window] |= near & (top > h + 0.05)
