@@ -188,12 +188,18 @@ def expand(
         if c.ry > 0:
             lit_to = wp.min(wp.max(c.rx * middle - (edge - 1) * c.ry, 0) / (2 * c.ry), cells)
             passed_to = wp.min(wp.max(c.rx * top - (edge - 2) * c.ry - 1, 0) / (2 * c.ry), cells)
+        gain = float(-wp.inf)
         for i in range(lit_from, lit_to):
             distance = start + length(s, edge + 1 + 2 * i, middle)
             n = begin - origin + i
+            gain = wp.max(gain, f.lit[w, n] - distance)
             if distance < f.lit[w, n]:
                 f.lit[w, n] = distance
                 f.source[w, n] = wp.uint16(source)
+        # distances grow no faster than the way: where another source is nearer by the width of two cells at
+        # every centre, which are one cell apart, it is nearer on every ray through them
+        if lit_to > lit_from and gain <= -4.0 * s.half:
+            continue
         first = begin + passed_from
         end = begin + passed_to
         while first < end:
