@@ -131,7 +131,7 @@ class Decoder(nn.Module):
             layers += [nn.ConvTranspose2d(before, width, stride, stride), nn.ReLU()]
             layers += [nn.Conv2d(width, width, 3, 1, 1), nn.ReLU()]
             before = width
-        self.trunk = nn.Sequential(*layers)
+        self.trunk = nn.Sequential(*layers[:-2])
         self.heads = nn.Conv2d(before + 3, sum(self._outputs), 1)
 
     def forward(self, latent: Tensor) -> Reconstruction:
@@ -150,6 +150,10 @@ class Autoencoder(nn.Module):
         super().__init__()
         self.encoder = Encoder(spec, directions)
         self.decoder = Decoder(self.encoder)
+        for trunk in (self.encoder.trunk, self.decoder.trunk):
+            for layer in trunk:
+                if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+                    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
 
 
 def save(path: Path, model: Autoencoder, extra: dict[str, Any] | None = None) -> None:

@@ -80,13 +80,13 @@ class PretrainSpec(Config):
     """Images, half from uniform poses and half on or near stairs and ramps (P)."""
     epochs: int = Field(default=10, ge=1)
     """Passes over the images, each with new corruption (P)."""
-    batch: int = Field(default=256, ge=1)
+    batch: int = Field(default=128, ge=1)
     """Images per gradient step (A)."""
     learning_rate: float = 1e-3
     """Peak of AdamW's learning rate, then a cosine to zero (A)."""
     weight_decay: float = 1e-4
     """Of AdamW (A)."""
-    sigma: float = Field(default=0.2, gt=0.0)
+    sigma: float = Field(default=1.0, gt=0.0)
     """Deviation of the likelihood behind the squared errors, m (A: weighs geometry against classes)."""
     kl_weight: float = 1.0
     """Weight of the Kullback-Leibler term (A: the evidence lower bound itself)."""

@@ -1,0 +1,372 @@
+"""Pretraining of an encoder on images from random poses (paper, "Pretraining Vision Encoders")."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn import functional
+
+from romnav import files, random
+from romnav.errors import RomnavError
+from romnav.sensing import encoder as checkpoints
+from romnav.sensing.corruption import Corruption
+from romnav.sensing.encoder import Autoencoder
+from romnav.sensing.spec import CorruptionSpec, PretrainSpec
+from romnav.world.grids import Grids
+from romnav.world.solids import Label
+from romnav.world.tile import Tile
+
+NEAR = 2.0
+"""Nodes this near to a stair or ramp count as oversampled poses, m (A: both mouths and the approach to them)."""
+SHARDS = 4
+"""Parts of a batch, on one thread each, whose gradients are summed in order: no thread count changes a bit."""
+LOG_INTERVAL = 25
+"""Gradient steps between two rows of the curve."""
+CHECKPOINT_INTERVAL = 500
+"""Gradient steps between two states for resumption; a multiple of `LOG_INTERVAL`."""
+DEAD_VARIANCE = 0.01
+"""A latent dimension whose posterior mean varies less over images is dead (Burda et al. 2016)."""
+TERMS = ("range", "xyz", "valid", "classes", "divergence")
+Progress = Callable[[int, int, str], None]
+
+
+class Sensor(Protocol):
+    """A range sensor over the tiles to be learned from: `romnav.sensing.lidar.Lidar` is one."""
+
+    directions: Tensor
+
+    def scan(self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: bool = False) -> Any: ...
+
+
+class Poses:
+    """Random poses of a sensor, half anywhere, half on or near stairs and ramps; a pure function of their index.
+
+    Args:
+        grids: Grids of each tile.
+        height: Sensor above the walking surface, m.
+        seed: Seed of the poses.
+        device: Torch device.
+    """
+
+    def __init__(self, grids: Sequence[Grids], height: float, seed: int, device: str = "cpu") -> None:
+        self._seed, self._height, self._cell = seed, height, grids[0].cell
+        self._node = torch.tensor(np.concatenate([g.position for g in grids]), device=device)
+        tile = np.repeat(np.arange(len(grids)), [len(g.position) for g in grids])
+        self._tile = torch.tensor(tile, dtype=torch.int32, device=device)
+        near = np.concatenate([_near_connector(g) for g in grids])
+        self._near = torch.tensor(np.flatnonzero(near if near.any() else ~near), device=device)
+
+    def __call__(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tile (B,), origin (B, 3) and yaw (B,) of the images ``index`` (B,); odd ones are oversampled."""
+        draw = [random.uniform(self._seed, index, k) for k in range(4)]
+        anywhere = random.integers(len(self._node), self._seed, index, 4)
+        near = self._near[random.integers(len(self._near), self._seed, index, 5)]
+        node = torch.where(index % 2 == 1, near, anywhere)
+        jitter = torch.stack(
+            [self._cell * (draw[0] - 0.5), self._cell * (draw[1] - 0.5), 0.1 * (draw[2] - 0.5)], 1
+        )
+        origin = self._node[node] + jitter
+        origin[:, 2] += self._height
+        return self._tile[node], origin, 2 * math.pi * draw[3]
+
+
+def _near_connector(grids: Grids) -> np.ndarray:
+    if not grids.connector.any():
+        return grids.connector
+    distance, _ = cKDTree(grids.position[grids.connector]).query(grids.position, distance_upper_bound=NEAR)
+    return distance <= NEAR
+
+
+def divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
+    """KL divergence from the standard normal of each latent dimension, averaged over the batch, nat."""
+    return 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance).mean(0)
+
+
+def loss_terms(
+    model: Autoencoder,
+    spec: PretrainSpec,
+    seen: Tensor,
+    clean: Tensor,
+    labels: Tensor,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """Terms of the negative evidence lower bound per image, nat (`TERMS`; their sum is the loss).
+
+    Squared errors of range and points where there is a return, cross-entropies of the validity everywhere and of
+    each class where there is a return; all of the clean image, given the corrupted one that was ``seen``
+    (both (B, rows, columns)). ``labels`` (B, rows, columns) are `Label`, -1 without a return.
+    """
+    scale = spec.encoder.scale
+    with torch.autocast(clean.device.type, torch.bfloat16, enabled=spec.encoder.bfloat16):
+        mean, log_variance = (x.float() for x in model.encoder.posterior(seen))
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        out = model.decoder(mean + (0.5 * log_variance).exp() * noise)
+    valid = (clean > 0).float()
+    count, precision = len(clean), 0.5 * (scale / spec.sigma) ** 2
+    target = clean / scale
+    points = model.encoder.directions.permute(2, 0, 1) * target[:, None]
+    one_hot = functional.one_hot(labels.long().clamp(min=0), len(Label)).permute(0, 3, 1, 2).float()
+    classes = functional.binary_cross_entropy_with_logits(out.classes.float(), one_hot, reduction="none")
+    xyz = (out.xyz - points[:, : out.xyz.shape[1]]).square().sum(1)
+    return {
+        "range": precision * (valid * (out.range - target).square()).sum() / count,
+        "xyz": precision * (valid * xyz).sum() / count,
+        "valid": functional.binary_cross_entropy_with_logits(out.valid.float(), valid, reduction="sum")
+        / count,
+        "classes": (valid * classes.sum(1)).sum() / count,
+        "divergence": spec.kl_weight * divergence(mean, log_variance).clamp(min=spec.free_bits).sum(),
+    }
+
+
+def pretrain(
+    spec: PretrainSpec,
+    tiles: Sequence[tuple[Tile, Grids]],
+    sensor: Sensor,
+    height: float,
+    out: Path,
+    *,
+    device: str = "cpu",
+    progress: Progress = lambda done, total, metric: None,
+    resume: bool = True,
+) -> Path:
+    """Train an encoder on images of ``tiles`` and write ``encoder.pt`` and ``curve.csv`` into ``out``.
+
+    Images are rendered as they are needed: each is a function of the seed and its index. A run that was killed goes
+    on from ``state.pt`` and ends with the same weights as one that was not; a finished one does nothing.
+
+    Args:
+        spec: Network, corruption and optimisation.
+        tiles: The tiles of ``sensor``, in its order.
+        sensor: What makes the images.
+        height: Sensor above the walking surface, m.
+        out: Folder of the results.
+        device: Torch device of the training and of the sensor.
+        progress: Told (images done, images in all, loss).
+        resume: Whether to go on from an earlier run of the same spec.
+
+    Returns:
+        Path of the checkpoint.
+    """
+    path, state_path = out / "encoder.pt", out / "state.pt"
+    poses = Poses([grids for _, grids in tiles], height, spec.seed, device)
+    key = _key(spec, sensor, poses)
+    if resume and path.exists() and checkpoints.read(path).get("key") == key:
+        return path
+    state = _Training(spec, sensor, poses, key, device)
+    if resume and state_path.exists():
+        state.restore(state_path)
+    with _one_thread() as threads, ThreadPoolExecutor(threads) as pool:
+        while state.step < state.steps:
+            text = state.advance(pool)
+            done = min(state.step * spec.batch, spec.images * spec.epochs)
+            progress(done, spec.images * spec.epochs, text)
+            if state.step % CHECKPOINT_INTERVAL == 0 and state.step < state.steps:
+                state.save(state_path)
+    files.write(out / "curve.csv", state.curve())
+    checkpoints.save(path, state.model, {"key": key})
+    state_path.unlink(missing_ok=True)
+    return path
+
+
+class _Training:
+    """A training run: everything that changes from one gradient step to the next."""
+
+    def __init__(self, spec: PretrainSpec, sensor: Sensor, poses: Poses, key: str, device: str) -> None:
+        self._spec, self._sensor, self._poses, self._key, self._device = spec, sensor, poses, key, device
+        with torch.random.fork_rng():
+            torch.manual_seed(spec.seed)
+            self.model = Autoencoder(spec.encoder, sensor.directions).to(device)
+        self._parameters = list(self.model.parameters())
+        self._optimizer = torch.optim.AdamW(
+            self._parameters, spec.learning_rate, weight_decay=spec.weight_decay, foreach=True
+        )
+        self._corrupt = Corruption(spec.corruption, spec.seed, device)
+        self._per_epoch = max(spec.images // spec.batch, 1)
+        self.steps = self._per_epoch * spec.epochs
+        self.step = 0
+        self._rows: list[list[float]] = []
+        self._recent = torch.zeros(len(TERMS), dtype=torch.float64)
+
+    def advance(self, pool: ThreadPoolExecutor) -> str:
+        """One gradient step; returns what to show of it."""
+        spec = self._spec
+        epoch, position = divmod(self.step, self._per_epoch)
+        index = torch.arange(position * spec.batch, (position + 1) * spec.batch, device=self._device)
+        parts = list(pool.map(lambda k: self._gradients(index[k::SHARDS], epoch, k), range(SHARDS)))
+        rate = 0.5 * spec.learning_rate * (1.0 + math.cos(math.pi * self.step / self.steps))
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        for i, parameter in enumerate(self._parameters):
+            parameter.grad = sum((p[1][i] for p in parts[1:]), parts[0][1][i]) / SHARDS
+        self._optimizer.step()
+        terms = torch.stack([p[0] for p in parts]).mean(0)
+        self._recent += terms
+        self.step += 1
+        if self.step % LOG_INTERVAL == 0 or self.step == self.steps:
+            mean = self._recent / ((self.step - 1) % LOG_INTERVAL + 1)
+            self._rows.append([self.step, rate, float(mean.sum()), *mean.tolist()])
+            self._recent.zero_()
+        return f"loss {terms.sum():.1f} nat"
+
+    def _gradients(self, index: Tensor, epoch: int, shard: int) -> tuple[Tensor, tuple[Tensor, ...]]:
+        spec = self._spec
+        tile, origin, yaw = self._poses(index)
+        clean, labels = self._sensor.scan(tile, origin, yaw, labels=True)
+        seen = self._corrupt(clean, index, torch.full_like(index, epoch))
+        seed = int(random.bits(spec.seed, self.step, shard))
+        generator = torch.Generator(self._device).manual_seed(seed)
+        terms = loss_terms(self.model, spec, seen, clean, labels, generator)
+        total = torch.stack([terms[name] for name in TERMS])
+        return total.detach().double().cpu(), torch.autograd.grad(total.sum(), self._parameters)
+
+    def save(self, path: Path) -> None:
+        extra = {
+            "key": self._key,
+            "step": self.step,
+            "rows": self._rows,
+            "optimizer": self._optimizer.state_dict(),
+        }
+        checkpoints.save(path, self.model, extra)
+
+    def restore(self, path: Path) -> None:
+        """Go on from a state of the same spec; one of another spec, or a torn one, is left for a new run to replace."""
+        try:
+            content = checkpoints.read(path)
+        except RomnavError:
+            return
+        if content.get("key") != self._key:
+            return
+        self.model.load_state_dict(content["weights"])
+        self._optimizer.load_state_dict(content["optimizer"])
+        self.step, self._rows = content["step"], content["rows"]
+
+    def curve(self) -> str:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["step", "learning_rate", "loss", *TERMS])
+        writer.writerows([[int(step), *(f"{x:.6g}" for x in rest)] for step, *rest in self._rows])
+        return text.getvalue()
+
+
+def _key(spec: PretrainSpec, sensor: Sensor, poses: Poses) -> str:
+    """Fingerprint of everything that decides the weights."""
+    digest = hashlib.sha256(spec.model_dump_json().encode())
+    probe = torch.arange(256, device=sensor.directions.device)
+    tile, origin, yaw = poses(probe)
+    for tensor in (sensor.directions, sensor.scan(tile, origin, yaw)):
+        digest.update(tensor.cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+@contextmanager
+def _one_thread() -> Iterator[int]:
+    """Runs every operator on its caller's thread; yields how many threads there were."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield threads
+    finally:
+        torch.set_num_threads(threads)
+
+
+@torch.no_grad()
+def quality(
+    model: Autoencoder,
+    tiles: Sequence[tuple[Tile, Grids]],
+    sensor: Sensor,
+    height: float,
+    corruption: CorruptionSpec,
+    *,
+    images: int = 4096,
+    seed: int = 0,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Errors of every head on ``tiles`` that the model was not trained on.
+
+    Poses are sampled as in training. ``corruption`` applies with no pixel dropout (the figures without a prefix), and
+    with half of the pixels lost (``dropout_50``).
+
+    Returns:
+        ``images``, ``iou`` by class, ``depth_mae_m``, ``depth_rmse_m``, ``xyz_error_m`` (mean distance), ``valid_iou``,
+        ``dead_dims``, ``latent_dims``, ``divergence_nat``; the same errors by tile class in ``tiles``, and all of
+        it again in ``dropout_50``.
+    """
+    poses = Poses([grids for _, grids in tiles], height, seed, device)
+    kinds = np.array([tile.kind.value for tile, _ in tiles])
+    result: dict[str, Any] = {"images": images}
+    for share in (0.0, 0.5):
+        corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)
+        sums, means, nats = {kind: _Errors() for kind in sorted(set(kinds))}, [], []
+        for index in torch.arange(images, device=device).split(256):
+            tile, origin, yaw = poses(index)
+            clean, labels = sensor.scan(tile, origin, yaw, labels=True)
+            mean, log_variance = model.encoder.posterior(corrupt(clean, index, torch.zeros_like(index)))
+            out = model.decoder(mean)
+            means.append(mean.flatten(1))
+            nats.append(divergence(mean, log_variance).sum())
+            of_tile = kinds[tile.cpu().numpy()]
+            for kind, errors in sums.items():
+                which = torch.tensor(of_tile == kind, device=device)
+                errors.add(
+                    model, clean[which], labels[which], checkpoints.Reconstruction(*(x[which] for x in out))
+                )
+        spread = torch.cat(means).var(0)
+        part = {
+            **sum(sums.values(), _Errors()).summary(),
+            "dead_dims": int((spread < DEAD_VARIANCE).sum()),
+            "latent_dims": len(spread),
+            "divergence_nat": round(float(torch.stack(nats).mean()), 2),
+            "tiles": {kind: errors.summary() for kind, errors in sums.items()},
+        }
+        result.update(part if share == 0.0 else {"dropout_50": part})
+    return result
+
+
+class _Errors:
+    """Sums from which the errors of a set of images follow."""
+
+    def __init__(self) -> None:
+        self.geometry = torch.zeros(5, dtype=torch.float64)
+        self.overlap = torch.zeros(2, len(Label) + 1, dtype=torch.int64)
+
+    def __add__(self, other: _Errors) -> _Errors:
+        both = _Errors()
+        both.geometry = self.geometry + other.geometry
+        both.overlap = self.overlap + other.overlap
+        return both
+
+    def add(self, model: Autoencoder, clean: Tensor, labels: Tensor, out: checkpoints.Reconstruction) -> None:
+        scale, valid = model.encoder.spec.scale, clean > 0
+        error = (out.range * scale - clean)[valid].double()
+        points = model.encoder.directions.permute(2, 0, 1) * clean[:, None]
+        xyz = (out.xyz * scale - points[:, : out.xyz.shape[1]]).norm(dim=1)[valid].double()
+        sums = [error.abs().sum(), error.square().sum(), xyz.sum(), valid.sum()]
+        self.geometry[:4] += torch.stack([s.double() for s in sums]).cpu()
+        guess, truth = out.classes.argmax(1)[valid], labels[valid].long()
+        masks = [(guess == k, truth == k) for k in range(len(Label))] + [(out.valid > 0, valid)]
+        for k, (a, b) in enumerate(masks):
+            self.overlap[0, k] += int((a & b).sum())
+            self.overlap[1, k] += int((a | b).sum())
+
+    def summary(self) -> dict[str, Any]:
+        absolute, squared, xyz, count, _ = (float(x) for x in self.geometry)
+        iou = [round(float(i / u), 4) if u else None for i, u in self.overlap.T]
+        return {
+            "iou": {label.name.lower(): value for label, value in zip(Label, iou, strict=False)},
+            "valid_iou": iou[-1],
+            "depth_mae_m": round(absolute / count, 4),
+            "depth_rmse_m": round(math.sqrt(squared / count), 4),
+            "xyz_error_m": round(xyz / count, 4),
+        }
