@@ -31,7 +31,7 @@ class Status(IntEnum):
     FILTERED = 1
     """The nearest safe velocity, scaled back if the period required it."""
     ESCAPING = 2
-    """The robot stands where h <= 0; the command leads outward."""
+    """The robot touches the boundary of the inflated region or is inside of it; the command leads outward."""
     BLOCKED = 3
     """No velocity fulfils the barrier condition: h has no gradient here, or there is no free cell at all."""
     OUTSIDE = 4
@@ -42,8 +42,8 @@ class Status(IntEnum):
     """A position, a desired velocity or a valid point is NaN or infinite."""
 
 
-# Aim of the barrier condition above zero, in cells: far above rounding, far below any clearance.
-_AIM = wp.constant(wp.float64(1e-3))
+# The boundary is where h is this many cells, not zero: far above rounding, far below any clearance.
+_TOUCH = wp.constant(wp.float64(1e-3))
 _INF = wp.constant(wp.float64(wp.inf))
 # Squared gradient below which h is flat, (m/m)^2; the mean slope at a boundary is one.
 _FLAT = wp.constant(wp.float64(1e-12))
@@ -100,6 +100,32 @@ def _patch(h: wp.array3d(dtype=float), b: int, i: int, j: int):
 
 
 @wp.func
+def _value(h: wp.array3d(dtype=float), b: int, x: wp.vec2d):
+    i = wp.min(int(x[0]), h.shape[1] - 2)
+    j = wp.min(int(x[1]), h.shape[2] - 2)
+    c = _patch(h, b, i, j)
+    u = x[0] - wp.float64(i)
+    w = x[1] - wp.float64(j)
+    return c[0] + c[1] * u + c[2] * w + c[3] * u * w
+
+
+@wp.func
+def _slope(h: wp.array3d(dtype=float), b: int, x: wp.vec2d, last: wp.vec2d):
+    """Central difference over one cell: the bilinear gradient in the middle of a patch, and continuous elsewhere.
+
+    The bilinear gradient itself jumps where patches meet, and a robot would get caught on the seams.
+    """
+    slope = wp.vec2d()
+    for k in range(2):
+        step = wp.vec2d()
+        step[k] = wp.float64(0.5)
+        ahead = wp.min(x + step, last)
+        behind = wp.max(x - step, wp.vec2d())
+        slope[k] = (_value(h, b, ahead) - _value(h, b, behind)) / (ahead[k] - behind[k])
+    return slope
+
+
+@wp.func
 def _along(c: wp.vec4d, x: wp.float64, y: wp.float64, dx: wp.float64, dy: wp.float64):
     """Coefficients of 1, s and s^2 of a patch along the line (x + s dx, y + s dy)."""
     return wp.vec3d(
@@ -133,23 +159,26 @@ def _first_below(q: wp.vec3d, target: wp.float64, start: wp.float64, stop: wp.fl
 
 
 @wp.func
-def _safe_share(h: wp.array3d(dtype=float), b: int, x: wp.vec2d, d: wp.vec2d, level: wp.float64, retain: wp.float64):
-    """Share of the displacement d (in cells, from x) up to which h stays above what must remain.
+def _safe_share(
+    h: wp.array3d(dtype=float),
+    b: int,
+    x: wp.vec2d,
+    d: wp.vec2d,
+    target: wp.float64,
+    escaping: bool,
+    retain: wp.float64,
+):
+    """Share of the displacement d (in cells, from x) up to which h stays above the target.
 
-    From a free start that is a share of its h. From inside an obstacle h must not fall below its value there, nor
-    below zero once it has been positive. The grid's outermost nodes are never passed.
+    A robot on its way out of an obstacle must not fall back into one. The grid's outermost nodes are never reached.
     """
-    target = wp.where(level > wp.float64(0.0), retain * level, level)
-    cell = wp.vec2i(
-        wp.min(int(wp.floor(x[0])), h.shape[1] - 2),
-        wp.min(int(wp.floor(x[1])), h.shape[2] - 2),
-    )
+    cell = wp.vec2i(wp.min(int(x[0]), h.shape[1] - 2), wp.min(int(x[1]), h.shape[2] - 2))
     s = wp.float64(0.0)
     while s < wp.float64(1.0):
         i = cell[0]
         j = cell[1]
         if i < 0 or j < 0 or i > h.shape[1] - 2 or j > h.shape[2] - 2:
-            return s
+            return wp.max(s - _TOUCH / wp.length(d), wp.float64(0.0))
         end = wp.vec2d(_INF, _INF)
         for k in range(2):
             if d[k] > wp.float64(0.0):
@@ -158,8 +187,8 @@ def _safe_share(h: wp.array3d(dtype=float), b: int, x: wp.vec2d, d: wp.vec2d, le
                 end[k] = (wp.float64(cell[k]) - x[k]) / d[k]
         stop = wp.clamp(wp.min(end), s, wp.float64(1.0))
         q = _along(_patch(h, b, i, j), x[0] - wp.float64(i), x[1] - wp.float64(j), d[0], d[1])
-        if _at(q, s) > wp.float64(0.0):
-            target = wp.max(target, wp.float64(0.0))
+        if escaping and _at(q, s) > wp.float64(0.0):
+            target = wp.max(target, retain * _at(q, s))
         below = _first_below(q, target, s, stop)
         if below <= stop:
             return below
@@ -198,34 +227,34 @@ def _filter(
     if not (wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(wanted[0]) and wp.isfinite(wanted[1])):
         status[b] = wp.static(int(Status.NOT_FINITE))
         return
-    rows = h.shape[1] - 1
-    columns = h.shape[2] - 1
-    if wp.min(x) < wp.float64(0.0) or x[0] > wp.float64(rows) or x[1] > wp.float64(columns):
+    last = wp.vec2d(wp.float64(h.shape[1] - 1), wp.float64(h.shape[2] - 1))
+    if wp.min(x) < wp.float64(0.0) or wp.min(last - x) < wp.float64(0.0):
         status[b] = wp.static(int(Status.OUTSIDE))
         return
-    i = wp.min(int(wp.floor(x[0])), rows - 1)
-    j = wp.min(int(wp.floor(x[1])), columns - 1)
-    c = _patch(h, b, i, j)
-    u = x[0] - wp.float64(i)
-    w = x[1] - wp.float64(j)
-    value = _along(c, u, w, wp.float64(0.0), wp.float64(0.0))[0]
-    slope = wp.vec2d(c[1] + c[3] * w, c[2] + c[3] * u) / cell
+    value = _value(h, b, x)
+    slope = _slope(h, b, x, last) / cell
     level[b] = value
     gradient[b] = slope
-    bound = alpha * (_AIM * cell - value)
-    if value <= wp.float64(0.0):
+    bound = alpha * (_TOUCH * cell - value)
+    touches = bound >= wp.float64(0.0)
+    if touches:
         bound = wp.max(bound, escape * wp.length(slope))
     v, feasible = _cbf_qp(wanted, slope, bound, lower, upper)
-    if wp.length_sq(slope) < _FLAT or value > wp.float64(0.0):
-        if not feasible:
-            status[b] = wp.static(int(Status.BLOCKED))
-            return
-    share = _safe_share(h, b, x, v * (period / cell), value, retain)
+    if not feasible and (wp.length_sq(slope) < _FLAT or not touches):
+        status[b] = wp.static(int(Status.BLOCKED))
+        return
+    target = wp.where(touches, value, retain * value)
+    share = _safe_share(h, b, x, v * (period / cell), target, touches, retain)
+    if touches and share < wp.float64(1.0):
+        # Along what is wanted there is no way out that lasts; so straight out, free of the wish and of small dips.
+        v, feasible = _cbf_qp(wp.vec2d(), slope, bound, lower, upper)
+        target = wp.where(value > wp.float64(0.0), value, -_INF)
+        share = _safe_share(h, b, x, v * (period / cell), target, touches, retain)
     v = v * share
     velocity[b] = v
     if share == wp.float64(0.0):
         status[b] = wp.static(int(Status.BLOCKED))
-    elif value <= wp.float64(0.0):
+    elif touches:
         status[b] = wp.static(int(Status.ESCAPING))
     elif v == wanted:
         status[b] = wp.static(int(Status.UNCHANGED))

@@ -18,7 +18,8 @@ import warp as wp
 from romnav.errors import RomnavError
 from romnav.safety.spec import OccupancySpec
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
+wp.init()
 
 # Occupancy cells along a side of a ground cell: enough returns in each on the ground a few metres away.
 _GROUND_CELLS = wp.constant(2)

@@ -15,7 +15,8 @@ import warp as wp
 from romnav.errors import RomnavError
 from romnav.safety.spec import PoissonSpec
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
+wp.init()
 
 # Cells lie at the centres; a boundary is the face between a free and an occupied cell, where h = 0. By linear
 # extrapolation over that face the neighbour of the other phase counts as -h_i, which adds one to the diagonal, so
