@@ -25,6 +25,8 @@ COLOURS = {
 WALL = "#aab4c0"
 OCCUPIED = "#49566a"
 PATH = "#b2182b"
+PANE = 0.22
+"""Opacity of walls and upper floors."""
 LIGHT = np.array([0.30, 0.45, 0.84])
 
 
@@ -103,34 +105,35 @@ def render(tile: Tile, azimuth: float, elevation: float, pixels: int = 1000) -> 
         if glass[mesh.solid[t]]:
             fragments.append((rows, cols, z, np.full(len(rows), t)))
             continue
-        near = z > depth[rows, cols]
-        rows, cols = rows[near], cols[near]
-        depth[rows, cols], owner[rows, cols] = z[near], mesh.solid[t]
+        seen = z > depth[rows, cols]
+        rows, cols = rows[seen], cols[seen]
+        depth[rows, cols], owner[rows, cols] = z[seen], mesh.solid[t]
         image[rows, cols] = paint[t]
     edge = np.zeros((high, width), bool)
     edge[:, 1:] |= owner[:, 1:] != owner[:, :-1]
     edge[1:] |= owner[1:] != owner[:-1]
     image[edge] *= 0.72
     if fragments:
-        r, c, z, t = (np.concatenate(part) for part in zip(*fragments, strict=True))
-        front = z > depth[r, c]
-        r, c, z, t = r[front], c[front], z[front], t[front]
-        order = np.lexsort((z, r * width + c))
-        r, c, t = r[order], c[order], t[order]
-        pixel = r * width + c
+        row, col, near, face = (np.concatenate(part) for part in zip(*fragments, strict=True))
+        pixel = row * width + col
+        order = np.lexsort((near, pixel))
+        order = order[near[order] > depth[row[order], col[order]]]
+        pixel, face = pixel[order], face[order]
         first = np.flatnonzero(np.diff(pixel, prepend=-1))
         rank = np.arange(len(pixel)) - np.repeat(first, np.diff(first, append=len(pixel)))
-        for k in range(int(rank.max(initial=-1)) + 1):
-            at = rank == k
-            image[r[at], c[at]] += 0.22 * (paint[t[at]] - image[r[at], c[at]])
+        flat = image.reshape(-1, 3)
+        for k in range(int(rank.max(initial=-1)) + 1):  # the farthest pane of every pixel first
+            at = pixel[rank == k]
+            flat[at] += PANE * (paint[face[rank == k]] - flat[at])
     return image[::-1]
 
 
 def _see_through(solids: Solids) -> NDArray[np.bool_]:
     """(S,) walls and upper floors."""
-    thin = 2.0 * solids.half.min(axis=1)
-    wall = (solids.shape == Shape.BOX) & ~solids.walkable & (solids.top - solids.bottom > 0.85)
-    wall &= (thin > 0.12) & (thin < 0.32)
+    extent, tall = 2.0 * solids.half, solids.top - solids.bottom
+    thin = extent.min(axis=1)
+    wall = (solids.shape == Shape.BOX) & ~solids.walkable & (extent.max(axis=1) > 0.55) & (thin < 0.32)
+    wall &= ((tall > 0.85) & (thin > 0.12)) | (tall > 2.5)
     upper = (solids.layers[:, 0] > 0) & (solids.label == Label.GROUND) & (solids.layers[:, 0] % 2 == 0)
     return wall | upper
 

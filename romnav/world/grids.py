@@ -20,11 +20,11 @@ OFFSETS_8 = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1
 
 @dataclass(frozen=True)
 class Grids:
-    """Grids of a tile over ``L`` layers of ``N x N`` cells, indexed ``[layer, ix, iy]``, and their free cells.
+    """Grids of a tile over ``L`` layers of ``N x N`` cells, ``[layer, ix, iy]``, and their free cells.
 
-    Cell ``(ix, iy)`` covers ``[ix, ix + 1) x [iy, iy + 1)`` times ``cell`` metres. Free cells are *nodes*; a connector
-    cell that two layers share is one node, named by both, so that motion and geodesics agree across layers.
-    All nodes of a tile are mutually reachable.
+    Cell ``(ix, iy)`` covers ``[ix, ix + 1) x [iy, iy + 1)`` times ``cell`` metres. Free cells are *nodes*; a
+    connector cell that two layers share is one node, named by both, so that motion and geodesics agree across
+    layers. All nodes of a tile are mutually reachable.
     """
 
     cell: float
@@ -68,17 +68,17 @@ class Grids:
 def rasterise(tile: Tile, spec: GridSpec) -> Grids:
     """Derive the grids of ``tile`` from its solids alone.
 
-    A cell is occupied where its layer has no walking surface, where a solid fills part of the robot's cylinder
-    above it, or where a drop-off (a height difference above ``max_step`` or the end of the surface) is nearer
-    than the robot's radius. Terrain of the cell's own layers is no obstacle: the next step of a staircase rises
-    higher than a robot could step over a box.
+    A cell is occupied where its layer has no walking surface, where a solid fills part of the robot's
+    cylinder above it, or where a drop-off (a height difference above ``max_step`` or the end of the surface)
+    is nearer than the robot's radius. Terrain of the cell's own layers is no obstacle: the next step of a
+    staircase rises higher than a robot could step over a box.
     """
     count = round(tile.side / spec.cell)
     layers = len(tile.layers)
     shape = (layers, count, count)
     height = np.full(shape, np.nan)
     surface = np.full(shape, -1, np.int32)
-    centres = (np.arange(count) + 0.5) * spec.cell
+    centres = ((np.arange(count) + 0.5) * spec.cell).astype(np.float64)
     for layer in range(layers):
         for s in np.flatnonzero(_on_layer(tile.solids, layer)):
             window, u, _, inside = _footprint(tile.solids, int(s), centres, 0.0)
@@ -212,7 +212,7 @@ def _number_nodes(
 
 
 def _components(identity: NDArray[np.intp], layers: int) -> NDArray[np.int32]:
-    """Connected component of each cell; ``identity`` names a shared cell alike on both layers, -1 if occupied."""
+    """Component of each cell; ``identity`` names a shared cell alike on both layers, -1 if not free."""
     pairs = []
     for a, b in (
         (identity[:, 1:], identity[:, :-1]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,7 @@ class Core:
 
 @dataclass(frozen=True)
 class Plan:
-    """What all storeys of a building share. Local frame: origin at the building's corner, u along the corridor."""
+    """What all storeys of a building share; frame: origin at the building's corner, u along the corridor."""
 
     frame: Frame
     length: float
@@ -90,7 +91,7 @@ def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
     rows = [int(r) for r in rng.permutation(2)][: 1 if rng.random() < 0.4 else 2]
     relay = len(rows) == 2 and storeys == 3 and rng.random() < 0.35
     cores = []
-    for k, row in enumerate(rows):
+    for k, row in enumerate(rows if storeys > 1 else []):
         first, last = ((k, k + 1) if relay else (0, storeys - 1)) if k == 0 or relay else _span(rng, storeys)
         core = _draw_core(rng, spec, empty, row, first, last)
         if core is not None:
@@ -114,7 +115,7 @@ def _draw_core(
         flight = (
             draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width)
         )
-        stairs = Staircase(flight, float(rng.uniform(1.4, 1.8)), turn=kind != 2)
+        stairs = Staircase(flight, float(rng.uniform(1.4, 1.8)), turn=kind != 2, walled=rng.random() < 0.35)
         wide, reach = 2 * stairs.half_width, stairs.length
         along = reach + APPROACH * (1 if stairs.turn else 2)
         if kind == 0:
@@ -243,14 +244,15 @@ def _rooms(
     """Divide a row into rooms around its halls, with walls and doors; their clear rectangles."""
     v = plan.row(row)
     halls = sorted(core.hall for core in plan.cores if core.row == row and core.touches(storey))
-    rooms, start = [], WALL
+    rooms: list[tuple[Span, Span]] = []
+    start = WALL
     for hall in [*halls, (plan.length - WALL, plan.length)]:
         stretch = hall[0] - start
         if stretch > 2.0:
             count = max(1, round(stretch / float(rng.uniform(3.4, 6.5))))
             cuts = start + stretch * (np.arange(1, count) + rng.uniform(-0.15, 0.15, count - 1)) / count
             edges = [start, *(float(c) for c in cuts), hall[0]]
-            for a, b in zip(edges[:-1], edges[1:], strict=True):
+            for a, b in itertools.pairwise(edges):
                 rooms.append(((a, b), v))
             bounds = edges[1:-1] + [e for e in (start, hall[0]) if WALL < e < plan.length - WALL - 1e-9]
             for u in bounds:
@@ -258,9 +260,9 @@ def _rooms(
                 _wall(solids, rng, floor, side, v[1] - v[0], z, rng.random() < 0.35)
         start = hall[1]
     edge = plan.frame.sub(0.0, plan.corridor[0] if row == 0 else plan.corridor[1])
-    for u, _ in rooms:
+    for (a, b), _ in rooms:
         if rng.random() < 0.88:
-            _wall(solids, rng, floor, edge.sub(u[0], 0.0), u[1] - u[0], z, True)
+            _wall(solids, rng, floor, edge.sub(a, 0.0), b - a, z, True)
     return rooms
 
 

@@ -301,8 +301,8 @@ def furnish(
 ) -> None:
     """Put up to ``count`` items into the local rectangle ``[0, size[0]] x [0, size[1]]``.
 
-    Items keep ``gap`` (m) from each other; those that do not stand against a wall keep it from the walls too and
-    are rotated at random with probability ``turn``.
+    Items keep ``gap`` (m) from each other; those that do not stand against a wall keep it from the walls too
+    and are rotated at random with probability ``turn``.
     """
     for _ in range(count):
         item = items[int(rng.integers(len(items)))]

@@ -54,7 +54,7 @@ def generate_counted(spec: WorldSpec, index: int) -> tuple[Tile, Grids, int]:
 
 
 def fault(tile: Tile, grids: Grids) -> str | None:
-    """What the connected free space of ``tile`` fails to reach, for which it must not be used; None if nothing."""
+    """What the connected free space of ``tile`` fails to reach; None if the tile may be used."""
     area = grids.cell**2
     free = grids.free
     for storey in tile.storeys:

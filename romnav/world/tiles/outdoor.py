@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -39,6 +40,17 @@ class Plot:
     def frame(self) -> Frame:
         """Frame at its corner."""
         return Frame(self.u[0], self.v[0])
+
+    def contains(self, frame: Frame, u: Span, v: Span) -> bool:
+        """Whether a rectangle local to ``frame`` lies within."""
+        x, y = np.transpose([frame.at(a, b) for a in u for b in v])
+        slack = 1e-6
+        return bool(
+            x.min() > self.u[0] - slack
+            and x.max() < self.u[1] + slack
+            and y.min() > self.v[0] - slack
+            and y.max() < self.v[1] + slack
+        )
 
 
 def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
@@ -111,7 +123,7 @@ def _street(rng: np.random.Generator, side: float) -> list[Plot]:
     for k in (0, 4):
         count = int(rng.integers(1, 4))
         ends = np.linspace(0.0, side, count + 1)
-        for a, b in zip(ends[:-1], ends[1:], strict=True):
+        for a, b in itertools.pairwise(ends):
             z = curb + float(rng.choice([0.0, rng.uniform(0.4, 1.0), rng.uniform(1.0, 2.3)]))
             add((float(a), float(b)), (lines[k], lines[k + 1]), z, STREET)
     return plots
@@ -149,18 +161,26 @@ class _Site:
                 joined = True
             else:
                 wanted = 1 + int(self.rng.poisson(shared[1] / 14.0)) if group[low] != group[high] else 1
-                joined = self.climb(*shared, plots[low].z, rise, wanted, plots[high]) > 0
+                joined = self.climb(*shared, plots[low].z, rise, wanted, (plots[low], plots[high])) > 0
             if joined:
                 group = [group[low] if g == group[high] else g for g in group]
 
     def climb(
-        self, frame: Frame, length: float, z: float, rise: float, wanted: int, upper: Plot | None = None
+        self,
+        frame: Frame,
+        length: float,
+        z: float,
+        rise: float,
+        wanted: int,
+        plots: tuple[Plot, Plot] | None = None,
     ) -> int:
-        """Build up to ``wanted`` flights over the edge along u (lower ground at v > 0), and perhaps a railing.
+        """Build up to ``wanted`` flights over the edge along u (lower ground at v > 0), perhaps a railing.
 
-        Flights stand before the edge, or in a notch of the ``upper`` plot. Returns how many were built.
+        Flights stand before the edge or, between two ``plots`` (lower, upper), in a notch of the upper one.
+        Returns how many were built.
         """
-        rng, built = self.rng, []
+        rng = self.rng
+        built: list[Span] = []
         for _ in range(8 * wanted):
             if len(built) == wanted:
                 break
@@ -174,11 +194,17 @@ class _Site:
                 if rng.random() < 0.45
                 else draw_stair(rng, self.spec, rise, width)
             )
-            inset = upper is not None and rng.random() < 0.35
+            inset = plots is not None and rng.random() < 0.35
             at = float(rng.uniform(0.4, length - width - 0.4)) + width / 2
             foot = frame.sub(at, 0.0 if inset else flight.length, -np.pi / 2)
             v = (-width / 2, width / 2)
             if not self.floor.fits(foot, (-1.3, flight.length + 1.3), (v[0] - 0.15, v[1] + 0.15)):
+                continue
+            brink = 0.0 if inset else flight.length
+            if plots is not None and not (
+                plots[0].contains(foot, (-1.3, brink), v)
+                and plots[1].contains(foot, (brink, flight.length + 1.3), v)
+            ):
                 continue
             add_flight(self.solids, foot, z, flight, (0, 0), base=z - 0.1)
             built.append((at - width / 2, at + width / 2))
@@ -186,10 +212,10 @@ class _Site:
             points.append((flight.length + MOUTH, 0.0, z + rise))
             self.connectors.append(Connector(flight.kind, foot.path(points), width, (0, 0)))
             guarded = rise > 0.5 and rng.random() < 0.6
-            if inset and upper is not None:
+            if inset and plots is not None:
                 corners = [foot.at(u, w) for u in (0.0, flight.length) for w in v]
                 xs, ys = zip(*corners, strict=True)
-                upper.notches.append(((min(xs), max(xs)), (min(ys), max(ys))))
+                plots[1].notches.append(((min(xs), max(xs)), (min(ys), max(ys))))
             for side in (-1, 1) if guarded else ():
                 if inset:
                     rail = foot.sub(0.0, side * (width / 2 + 0.06))
@@ -242,7 +268,7 @@ class _Site:
         self.floor.reserve(frame, *ground)
 
     def border(self, plots: list[Plot]) -> None:
-        """Close the tile: on each side a wall, hedge, fence or house front stands on the plots' own heights."""
+        """Close the tile: on each side a wall, hedge, fence or house front on the plots' own heights."""
         styles = self.rng.choice(["wall", "hedge", "fence", "front"], 4)
         heights = self.rng.uniform((1.2, 1.0, 1.1, 3.5), (2.4, 1.6, 1.5, 6.0))
         fence = Railing(self.railing.spacing, 3, float(heights[2]))

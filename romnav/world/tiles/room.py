@@ -111,8 +111,9 @@ def _screens(
     """Free-standing partitions of any direction."""
     for _ in range(int(rng.integers(0, 4))):
         length, height = float(rng.uniform(1.5, 4.0)), float(rng.uniform(1.2, 2.4))
-        at = corner.sub(*(float(x) for x in rng.uniform((0, 0), inner)), float(rng.uniform(0, np.pi)))
-        u, v = (-length / 2, length / 2), (-0.05, 0.05)
-        if floor.fits(at, (u[0] - 1.0, u[1] + 1.0), (-1.0, 1.0)):
-            block(solids, at, u, v, (0.0, height))
-            floor.reserve(at, u, v, 1.0)
+        u, v, yaw = (float(x) for x in rng.uniform((0.0, 0.0, 0.0), (*inner, np.pi)))
+        at = corner.sub(u, v, yaw)
+        half = length / 2
+        if floor.fits(at, (-half - 1.0, half + 1.0), (-1.0, 1.0)):
+            block(solids, at, (-half, half), (-0.05, 0.05), (0.0, height))
+            floor.reserve(at, (-half, half), (-0.05, 0.05), 1.0)

@@ -60,7 +60,7 @@ def block(
 
 
 def edges(frame: Frame, size: tuple[float, float]) -> list[tuple[Frame, float]]:
-    """Sides of the local rectangle ``[0, size[0]] x [0, size[1]]``: frames with u along and v outward, and lengths."""
+    """Sides of the rectangle ``[0, size[0]] x [0, size[1]]``: frames (u along, v outward) and lengths."""
     u, v = size
     return [
         (frame.sub(u, 0.0, np.pi), u),
@@ -87,7 +87,7 @@ def cut(outer: tuple[Span, Span], holes: list[tuple[Span, Span]]) -> list[tuple[
 
 
 class Floor:
-    """Reservations on one storey, on a 0.1 m raster: keeps furniture out of doorways, stairs and other furniture."""
+    """Reservations on one storey, on a 0.1 m raster: keep furniture out of doorways, stairs and furniture."""
 
     def __init__(self, side: float, cell: float = 0.1) -> None:
         self._centres = (np.arange(round(side / cell)) + 0.5) * cell

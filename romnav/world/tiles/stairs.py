@@ -39,7 +39,7 @@ class Flight:
 
 @dataclass(frozen=True)
 class Railing:
-    """How railings look in one tile: post distance, number of wires between floor and handrail, heights in m."""
+    """How railings look in one tile: post distance (m), wires between floor and handrail, height (m)."""
 
     spacing: float
     wires: int
@@ -52,7 +52,7 @@ class Railing:
 
 
 def draw_stair(rng: np.random.Generator, spec: WorldSpec, rise: float, width: float) -> Flight:
-    """A random staircase of exactly ``rise``: risers and treads within the spec, the last riser meets the floor."""
+    """A random staircase of exactly ``rise``; the last riser meets the floor."""
     least, most = int(np.ceil(rise / spec.riser[1] - 1e-9)), int(np.floor(rise / spec.riser[0] + 1e-9))
     steps = int(rng.integers(least, max(least, min(most, round(1.35 * least))) + 1))
     return Flight(rise, (steps - 1) * float(rng.uniform(*spec.tread)), width, steps)
@@ -71,7 +71,7 @@ def add_flight(
     layers: tuple[int, int],
     base: float | None = None,
 ) -> None:
-    """Build ``flight`` from the foot at the frame's origin along u; solid down to ``base``, or hung with a soffit."""
+    """Build ``flight`` from the frame's origin along u; solid down to ``base``, or hung with a soffit."""
     v = (-flight.width / 2, flight.width / 2)
     if flight.steps == 0:
         slope = flight.rise / flight.length
@@ -101,7 +101,7 @@ def add_railing(
     rise: float = 0.0,
     kerb: bool = False,
 ) -> None:
-    """Posts, wires and handrail along the u axis from ``u[0]`` (floor height ``z``) to ``u[1]`` (``z + rise``)."""
+    """Posts, wires and handrail along u from ``u[0]`` (floor at ``z``) to ``u[1]`` (``z + rise``)."""
     length = u[1] - u[0]
     slope = rise / length
     middle = z + rise / 2
@@ -134,19 +134,21 @@ def add_railing(
 class Staircase:
     """Two flights and a landing half way, stackable storey upon storey.
 
-    Local frame: u points up the first flight, whose foot is at u = 0. A U-turn brings the second flight back to
-    u = 0, beside the first; a straight staircase goes on to ``length``. The half landing is a layer of its own, so
-    that staircases may be stacked and the space under them stays walkable.
+    Local frame: u points up the first flight, whose foot is at u = 0. A U-turn brings the second flight
+    back to u = 0, beside the first; a straight staircase goes on to ``length``. The half landing is a layer
+    of its own, so that staircases may be stacked and the space under them stays walkable.
     """
 
     flight: Flight
     landing: float
     turn: bool
+    walled: bool
+    """Whether its sides are closed by walls, else by kerbs and railings."""
 
     @property
     def kind(self) -> str:
         """Kind of its connector."""
-        return ("u-stair" if self.turn else "stair") if self.flight.steps else "ramp"
+        return "u-stair" if self.turn and self.flight.steps else self.flight.kind
 
     @property
     def length(self) -> float:
@@ -164,10 +166,10 @@ class Staircase:
         return (0.0, self.length), (-self.half_width, self.half_width)
 
     def build(self, solids: SolidsBuilder, frame: Frame, z: float, layer: int, railing: Railing) -> Connector:
-        """Build from the floor ``layer`` at ``z`` through the landing ``layer + 1`` to the floor ``layer + 2``."""
+        """Build from floor ``layer`` at ``z`` by the landing ``layer + 1`` to floor ``layer + 2``."""
         f, half = self.flight, self.flight.rise
         up, down = (layer, layer + 1), (layer + 1, layer + 2)
-        end, mid = f.length + self.landing, z + half
+        end, mid, top = f.length + self.landing, z + half, z + 2 * half
         c = (f.width + KERB) / 2 if self.turn else 0.0
         second = frame.sub(f.length, c, np.pi) if self.turn else frame.sub(end, 0.0)
         add_flight(solids, frame.sub(0.0, -c), z, f, up)
@@ -177,40 +179,37 @@ class Staircase:
             solids, frame, (f.length, end), (-wide, wide), (mid - SLAB, mid),
             label=Label.GROUND, layers=(layer + 1, layer + 1),
         )  # fmt: skip
-        run, out = (0.0, f.length), wide + KERB / 2
-        if self.turn:
-            for v in (-out, 0.0):
-                add_railing(solids, frame.sub(0.0, v), run, z, railing, rise=half, kerb=True)
-            for v in (0.0, out):
-                add_railing(solids, frame.sub(f.length, v, np.pi), run, mid, railing, rise=half, kerb=True)
-            add_railing(
-                solids, frame.sub(end + KERB / 2, 0.0, np.pi / 2), (-wide, wide), mid, railing, kerb=True
-            )
+        out = wide + KERB / 2
+        lower = [0.0] if self.turn else []
+        if self.walled:
+            walls = [((0.0, self.length), (v - KERB / 2, v + KERB / 2)) for v in (-out, out)]
+            walls += [((end, end + KERB), (-wide, wide))] if self.turn else []
+            for along, across in walls:
+                block(solids, frame, along, across, (z, top))
         else:
+            lower += [-out] if self.turn else [-out, out]
             for v in (-out, out):
-                add_railing(solids, frame.sub(0.0, v), run, z, railing, rise=half, kerb=True)
-                add_railing(solids, frame.sub(end, v), run, mid, railing, rise=half, kerb=True)
-        for v in (-out, out):
-            add_railing(solids, frame.sub(0.0, v), (f.length, end), mid, railing, kerb=True)
+                add_railing(solids, frame.sub(0.0, v), (f.length, end), mid, railing, kerb=True)
+            if self.turn:
+                back = frame.sub(end + KERB / 2, 0.0, np.pi / 2)
+                add_railing(solids, back, (-wide, wide), mid, railing, kerb=True)
+        for v in lower:
+            add_railing(solids, frame.sub(0.0, v), (0.0, f.length), z, railing, rise=half, kerb=True)
+            add_railing(solids, second.sub(0.0, c + v), (0.0, f.length), mid, railing, rise=half, kerb=True)
         points = [(-MOUTH, -c, z), (0.0, -c, z), (f.length, -c, mid)]
         if self.turn:
-            u = f.length + self.landing / 2
-            points += [
-                (u, -c, mid),
-                (u, c, mid),
-                (f.length, c, mid),
-                (0.0, c, mid + half),
-                (-MOUTH, c, mid + half),
-            ]
+            turn = f.length + self.landing / 2
+            points += [(turn, -c, mid), (turn, c, mid), (f.length, c, mid), (0.0, c, top), (-MOUTH, c, top)]
         else:
-            top = mid + half
             points += [(end, 0.0, mid), (end + f.length, 0.0, top), (end + f.length + MOUTH, 0.0, top)]
         return Connector(self.kind, frame.path(points), f.width, (layer, layer + 2))
 
     def guard(
         self, solids: SolidsBuilder, frame: Frame, z: float, railing: Railing, *, departs: bool
     ) -> None:
-        """Railings on the floor at ``z`` around the shaft; where no flight ``departs``, across its mouth too."""
+        """Railings on the floor at ``z`` around the shaft, and across its mouth if no flight ``departs``."""
+        if self.walled and departs:
+            return
         out = self.half_width + KERB / 2
         for v in (-out, out):
             add_railing(solids, frame.sub(0.0, v), (0.0, self.length), z, railing)
