@@ -129,7 +129,9 @@ def _slope(h: wp.array3d(dtype=float), b: int, x: wp.vec2d, last: wp.vec2d):
 def _along(c: wp.vec4d, x: wp.float64, y: wp.float64, dx: wp.float64, dy: wp.float64):
     """Coefficients of 1, s and s^2 of a patch along the line (x + s dx, y + s dy)."""
     return wp.vec3d(
-        c[0] + c[1] * x + c[2] * y + c[3] * x * y, c[1] * dx + c[2] * dy + c[3] * (x * dy + y * dx), c[3] * dx * dy
+        c[0] + c[1] * x + c[2] * y + c[3] * x * y,
+        c[1] * dx + c[2] * dy + c[3] * (x * dy + y * dx),
+        c[3] * dx * dy,
     )
 
 
@@ -401,7 +403,9 @@ class SafetyFilter:
         workers: Threads (CPU); kernels release the interpreter lock.
     """
 
-    def __init__(self, robots: int, spec: SafetySpec | None = None, device: str = "cpu", workers: int = 1) -> None:
+    def __init__(
+        self, robots: int, spec: SafetySpec | None = None, device: str = "cpu", workers: int = 1
+    ) -> None:
         self.spec = spec = spec or SafetySpec()
         # A few robots at a time keep their grids in a core's cache; a GPU takes all at once.
         share = min(robots, 4) if wp.get_device(device).is_cpu else robots
@@ -420,7 +424,9 @@ class SafetyFilter:
         for chunk, (_, solver) in zip(self._chunks, self._stages, strict=True):
             solver.reset(None if robots is None else robots[chunk])
 
-    def __call__(self, points: torch.Tensor, velocity: torch.Tensor, valid: torch.Tensor | None = None) -> Filtered:
+    def __call__(
+        self, points: torch.Tensor, velocity: torch.Tensor, valid: torch.Tensor | None = None
+    ) -> Filtered:
         """Filter one control period's commands.
 
         Args:
@@ -431,7 +437,11 @@ class SafetyFilter:
         """
         if velocity.shape != (self._robots, 2):
             raise RomnavError(f"velocity has shape {tuple(velocity.shape)}; expected ({self._robots}, 2)")
-        if points.ndim != 3 or len(points) != self._robots or (valid is not None and valid.shape != points.shape[:2]):
+        if (
+            points.ndim != 3
+            or len(points) != self._robots
+            or (valid is not None and valid.shape != points.shape[:2])
+        ):
             raise RomnavError(
                 f"points are {tuple(points.shape)}, valid {None if valid is None else tuple(valid.shape)}; "
                 f"expected ({self._robots}, N, 3) and ({self._robots}, N)"
@@ -452,5 +462,8 @@ class SafetyFilter:
         indices = range(len(self._chunks))
         parts = list(map(work, indices) if self._pool is None else self._pool.map(work, indices))
         return Filtered(
-            *(torch.cat([getattr(p, name) for p in parts]) for name in ("velocity", "status", "h", "gradient"))
+            *(
+                torch.cat([getattr(p, name) for p in parts])
+                for name in ("velocity", "status", "h", "gradient")
+            )
         )

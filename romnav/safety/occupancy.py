@@ -2,7 +2,7 @@
 
 The paper rasterises the cloud "after removing the ground" (Sec. "Poisson Safety Filter"). On slopes, stairs and
 landings no plane is the ground, so it is grown here from under the robot's feet over a coarse height map: a
-neighbouring cell belongs to it if its lowest return is within a step of it. What is not ground in that sense (a
+neighbouring cell belongs to it if its lowest return is within a step, give or take a slope, of it. What is not ground in that sense (a
 table top, the storey below a railing) inherits the ground next to it; a return is an obstacle if it lies more than
 a step above the ground of its cell and lower than the robot's height.
 """
@@ -63,7 +63,7 @@ def _grow(
 ):
     """Ground height of every cell, breadth first from the robot's feet at height zero.
 
-    The tolerance is a step, and the steepest rise over cells without a return since the last that was ground.
+    The tolerance is a step, and the steepest rise over the way from the last cell that was seen to be ground.
     """
     b = wp.tid()
     n = lowest.shape[1]
@@ -71,8 +71,8 @@ def _grow(
     ground[b, centre, centre] = 0.0
     gap[b, centre, centre] = 0.0
     queue[b, 0] = centre * n + centre
-    head = int(0)
-    tail = int(1)
+    head = wp.int32(0)
+    tail = wp.int32(1)
     while head < tail:
         here = queue[b, head]
         head += 1
@@ -85,10 +85,11 @@ def _grow(
             nj = j + k % 3 - 1
             if ni >= 0 and nj >= 0 and ni < n and nj < n and gap[b, ni, nj] < 0.0:
                 low = lowest[b, ni, nj]
+                away = unseen + cell * wp.length(wp.vec2(float(ni - i), float(nj - j)))
                 if low == _UNSEEN:
                     ground[b, ni, nj] = z
-                    gap[b, ni, nj] = unseen + cell * wp.length(wp.vec2(float(ni - i), float(nj - j)))
-                elif wp.abs(low - z) <= step + slope * unseen:
+                    gap[b, ni, nj] = away
+                elif wp.abs(low - z) <= step + slope * away:
                     ground[b, ni, nj] = low
                     gap[b, ni, nj] = 0.0
                 else:
@@ -127,11 +128,11 @@ def _distances(occupied: wp.array3d(dtype=wp.bool), distance: wp.array3d(dtype=i
     """Along one row, cells to the nearest occupied one."""
     b, i = wp.tid()
     n = occupied.shape[2]
-    since = int(1 << 14)
+    since = wp.int32(1 << 14)
     for j in range(n):
         since = wp.where(occupied[b, i, j], 0, since + 1)
         distance[b, i, j] = since
-    since = int(1 << 14)
+    since = wp.int32(1 << 14)
     for k in range(n):
         j = n - 1 - k
         since = wp.where(occupied[b, i, j], 0, since + 1)
@@ -140,7 +141,10 @@ def _distances(occupied: wp.array3d(dtype=wp.bool), distance: wp.array3d(dtype=i
 
 @wp.kernel(enable_backward=False)
 def _dilate(
-    distance: wp.array3d(dtype=int), half_width: wp.array(dtype=int), reach: int, inflated: wp.array3d(dtype=wp.bool)
+    distance: wp.array3d(dtype=int),
+    half_width: wp.array(dtype=int),
+    reach: int,
+    inflated: wp.array3d(dtype=wp.bool),
 ):
     """A cell is in the disc of an occupied cell if in some row the nearest one is within the disc's half width."""
     b, i = wp.tid()
@@ -162,7 +166,9 @@ def inflate(occupied: torch.Tensor, radius: float) -> torch.Tensor:
         radius: In cells.
     """
     if occupied.ndim != 3 or occupied.dtype != torch.bool:
-        raise RomnavError(f"occupancy is {occupied.dtype} {tuple(occupied.shape)}; expected bool (B, rows, columns)")
+        raise RomnavError(
+            f"occupancy is {occupied.dtype} {tuple(occupied.shape)}; expected bool (B, rows, columns)"
+        )
     reach = int(radius)
     # Least squares of integers against the square of the radius: no rounding at the disc's rim.
     widths = [math.isqrt(int(radius * radius + 1e-9) - k * k) for k in range(reach + 1)]
@@ -171,7 +177,9 @@ def inflate(occupied: torch.Tensor, radius: float) -> torch.Tensor:
     inflated = torch.empty_like(occupied)
     rows = occupied.shape[:2]
     into = wp.from_torch(distance)
-    wp.launch(_distances, dim=rows, inputs=[wp.from_torch(occupied.contiguous())], outputs=[into], device=device)
+    wp.launch(
+        _distances, dim=rows, inputs=[wp.from_torch(occupied.contiguous())], outputs=[into], device=device
+    )
     wp.launch(
         _dilate,
         dim=rows,
@@ -242,7 +250,9 @@ class Rasterizer:
         if valid is None:
             valid = torch.ones(points.shape[:2], dtype=torch.bool, device=device)
         if valid.shape != points.shape[:2] or valid.dtype != torch.bool:
-            raise RomnavError(f"valid is {valid.dtype} {tuple(valid.shape)}; expected bool {tuple(points.shape[:2])}")
+            raise RomnavError(
+                f"valid is {valid.dtype} {tuple(valid.shape)}; expected bool {tuple(points.shape[:2])}"
+            )
         cloud = wp.from_torch(points.float().contiguous(), dtype=wp.vec3)
         mask = wp.from_torch(valid.contiguous())
         used, broken = torch.zeros(2, self._robots, dtype=torch.int32, device=device)

@@ -85,9 +85,9 @@ def _discretise(
     rows = occupied.shape[1]
     columns = occupied.shape[2]
     count = wp.vec3i(0, 0, 0)
-    left = int(0)
-    here = int(0)
-    below = int(0)
+    left = wp.int32(0)
+    here = wp.int32(0)
+    below = wp.int32(0)
     for j in range(-1, columns):
         right = _free(occupied, b, i, j + 1)
         across = _free(occupied, b, i + 1, j + 1)
@@ -139,7 +139,15 @@ def _sweep(
     row = (b * (rows + 2) + i + 1) * stride + 1 + start
     length = wp.min(run, half - start)
     _relax(
-        h, weight, colour * plane + row, (1 - colour) * plane + row, stride, (i + colour) & 1, length, omega, forcing
+        h,
+        weight,
+        colour * plane + row,
+        (1 - colour) * plane + row,
+        stride,
+        (i + colour) & 1,
+        length,
+        omega,
+        forcing,
     )
 
 
@@ -197,7 +205,18 @@ class PoissonSolver:
                 wp.launch(
                     _sweep,
                     dim=(robots, rows, -(-half // run)),
-                    inputs=[self._weight, self._counts, active, colour, run, half, rows, plane, cell, spec.omega],
+                    inputs=[
+                        self._weight,
+                        self._counts,
+                        active,
+                        colour,
+                        run,
+                        half,
+                        rows,
+                        plane,
+                        cell,
+                        spec.omega,
+                    ],
                     outputs=[self._iterate],
                     device=device,
                     record_cmd=True,

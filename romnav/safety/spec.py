@@ -19,9 +19,9 @@ class OccupancySpec(Config):
     margin: float = Field(0.107, ge=0)
     """Added to the radius, m (A: 1.5 sqrt(2) cells, the least for which h > 0 proves that the disc is clear of every
     point, whatever the rounding to cells; 0 is the paper's plain convolution)."""
-    step: float = Field(0.25, gt=0)
-    """Height above the ground up to which a return is ground, m (A: the highest riser, 0.18 m, plus the fall of a
-    ground cell on the steepest stair)."""
+    step: float = Field(0.3, gt=0)
+    """Height above the ground up to which a return is ground, m (A: the highest riser, 0.18 m, and three standard
+    deviations of 0.02 m at either edge of it). Lower obstacles are the policy's to see."""
     slope: float = Field(0.7, ge=0)
     """Steepest rise per metre across ground that was not seen (A: the steepest stair, 0.18 / 0.26)."""
     height: float = Field(1.4, gt=0)

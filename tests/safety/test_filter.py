@@ -25,14 +25,18 @@ def qp_cases(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     rng = np.random.default_rng(seed)
     desired = rng.uniform(-1.5, 1.5, (count, 2))
     normal = rng.normal(size=(count, 2)) * 10 ** rng.uniform(-2, 1, (count, 1))
-    normal[:: 7, 0] = 0
-    normal[3 :: 7, 1] = 0
+    normal[::7, 0] = 0
+    normal[3::7, 1] = 0
     return desired, normal, rng.normal(size=count) * np.linalg.norm(normal, axis=1)
 
 
-def solve_qp(desired: np.ndarray, normal: np.ndarray, bound: np.ndarray, box: bool) -> tuple[np.ndarray, np.ndarray]:
+def solve_qp(
+    desired: np.ndarray, normal: np.ndarray, bound: np.ndarray, box: bool
+) -> tuple[np.ndarray, np.ndarray]:
     limits = (LOWER, UPPER) if box else ()
-    v, feasible = cbf_qp(torch.from_numpy(desired), torch.from_numpy(normal), torch.from_numpy(bound), *limits)
+    v, feasible = cbf_qp(
+        torch.from_numpy(desired), torch.from_numpy(normal), torch.from_numpy(bound), *limits
+    )
     return v.numpy(), feasible.numpy()
 
 
@@ -42,11 +46,19 @@ def test_a_million_programs_agree_with_enumerated_active_sets():
     v, feasible = solve_qp(desired, normal, bound, box=True)
     low, high = np.array(LOWER), np.array(UPPER)
     square = (normal**2).sum(1)
-    candidates = [np.clip(desired, low, high), desired + normal * ((bound - (normal * desired).sum(1)) / square)[:, None]]
+    candidates = [
+        np.clip(desired, low, high),
+        desired + normal * ((bound - (normal * desired).sum(1)) / square)[:, None],
+    ]
     for k in (0, 1):
         for side in (low[k], high[k]):
             point = np.full_like(desired, side)
-            np.divide(bound - normal[:, k] * side, normal[:, 1 - k], out=point[:, 1 - k], where=normal[:, 1 - k] != 0)
+            np.divide(
+                bound - normal[:, k] * side,
+                normal[:, 1 - k],
+                out=point[:, 1 - k],
+                where=normal[:, 1 - k] != 0,
+            )
             candidates.append(point)
     best = np.full(len(desired), np.inf)
     scale = np.sqrt(square)
@@ -116,7 +128,9 @@ def worlds(robots: int, n: int, seed: int) -> np.ndarray:
 def level(h: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Bilinear h at positions (robots, samples, 2)."""
     robots = np.broadcast_to(np.arange(len(h))[:, None], position.shape[:2])
-    return map_coordinates(h.astype(float), [robots, position[..., 0] / CELL, position[..., 1] / CELL], order=1, mode="nearest")
+    return map_coordinates(
+        h.astype(float), [robots, position[..., 0] / CELL, position[..., 1] / CELL], order=1, mode="nearest"
+    )
 
 
 def starts(h: np.ndarray, inside: bool, seed: int) -> np.ndarray:
@@ -197,7 +211,9 @@ def test_safe_commands_pass_and_others_move_least(seed, speed, angle):
     desired = np.tile([speed * np.cos(angle), speed * np.sin(angle)], (len(h), 1))
     out = filter_velocity(h, CELL, torch.from_numpy(position), torch.from_numpy(desired), spec)
     v, rate, value = out.velocity.numpy(), (out.gradient.numpy() * desired).sum(1), out.h.numpy()
-    path = level(h.numpy(), position[:, None] + np.linspace(0, 1, 65)[None, :, None] * desired[:, None] * spec.period)
+    path = level(
+        h.numpy(), position[:, None] + np.linspace(0, 1, 65)[None, :, None] * desired[:, None] * spec.period
+    )
     end = position + desired * spec.period
     stays = ((end >= 0) & (end <= 23 * CELL)).all(1)
     safe = (rate > -spec.alpha * value + 1e-3) & (path.min(1) > 0.51 * value) & stays
@@ -213,10 +229,15 @@ def test_gradient_is_that_of_the_interpolated_function():
     rng = np.random.default_rng(0)
     field = h.numpy()
     cells = rng.integers(0, 23, (500, 2))
-    for x, reach in (((cells + 0.5) * CELL, 1e-4), ((cells + rng.uniform(0.01, 0.99, (500, 2))) * CELL, CELL / 2)):
+    for x, reach in (
+        ((cells + 0.5) * CELL, 1e-4),
+        ((cells + rng.uniform(0.01, 0.99, (500, 2))) * CELL, CELL / 2),
+    ):
         inner = ((x > reach) & (x < 23 * CELL - reach)).all(1)
         x = x[inner]
-        out = filter_velocity(h.expand(len(x), -1, -1), CELL, torch.from_numpy(x), torch.zeros(len(x), 2).double())
+        out = filter_velocity(
+            h.expand(len(x), -1, -1), CELL, torch.from_numpy(x), torch.zeros(len(x), 2).double()
+        )
         np.testing.assert_allclose(out.h, level(field, x[None])[0], atol=1e-9)
         for k, step in enumerate(np.eye(2) * reach):
             slope = (level(field, (x + step)[None]) - level(field, (x - step)[None]))[0] / (2 * reach)
@@ -229,7 +250,9 @@ def test_gradient_converges_to_that_of_the_exact_solution():
     for n in (40, 160):
         x = (np.arange(n) + 0.5) * 2 / n - 1
         free = np.hypot(x[:, None], x) < 0.9
-        h = PoissonSolver(1, (n, n), 2 / n, PoissonSpec(cold_sweeps=3000)).solve(torch.from_numpy(~free)[None])
+        h = PoissonSolver(1, (n, n), 2 / n, PoissonSpec(cold_sweeps=3000)).solve(
+            torch.from_numpy(~free)[None]
+        )
         rng = np.random.default_rng(0)
         r, angle = rng.uniform(0.1, 0.8, 300), rng.uniform(0, 2 * np.pi, 300)
         point = np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
@@ -247,7 +270,9 @@ def test_passes_a_gap_of_three_cells():
     h = PoissonSolver(1, (40, 40), CELL).solve(occupied)
     position = torch.tensor([[10 * CELL, 20 * CELL]], dtype=torch.double)
     for _ in range(100):
-        position += 0.2 * filter_velocity(h, CELL, position, torch.tensor([[0.5, 0.0]], dtype=torch.double)).velocity
+        position += (
+            0.2 * filter_velocity(h, CELL, position, torch.tensor([[0.5, 0.0]], dtype=torch.double)).velocity
+        )
     assert position[0, 0] > 28 * CELL
 
 
@@ -292,7 +317,11 @@ def test_closed_loop_from_points_keeps_clear_of_them():
     poles[near] = 9.0
     position, yaw, closest, travelled = np.zeros((robots, 2)), rng.uniform(0, 6, robots), np.inf, 0.0
     for _ in range(60):
-        v = filter_(cloud(poles, yaw, position), torch.tensor([[1.0, 0.0]]).expand(robots, 2)).velocity.double().numpy()
+        v = (
+            filter_(cloud(poles, yaw, position), torch.tensor([[1.0, 0.0]]).expand(robots, 2))
+            .velocity.double()
+            .numpy()
+        )
         c, s = np.cos(yaw), np.sin(yaw)
         step = 0.2 * np.stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]], 1)
         for share in np.linspace(0, 1, 5):
@@ -358,7 +387,7 @@ def test_mistakes_are_named():
     h = torch.ones(2, 10, 10)
     with pytest.raises(RomnavError, match="position has shape"):
         filter_velocity(h, CELL, torch.zeros(1, 2), torch.zeros(2, 2))
-    with pytest.raises(RomnavError, match="h is torch.float64"):
+    with pytest.raises(RomnavError, match="h is torch"):
         filter_velocity(h.double(), CELL, torch.zeros(2, 2), torch.zeros(2, 2))
     filter_ = SafetyFilter(2)
     with pytest.raises(RomnavError, match="points are"):

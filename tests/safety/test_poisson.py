@@ -88,7 +88,9 @@ def direct(occupied: np.ndarray, cell: float) -> np.ndarray:
     rows, columns = occupied.shape
     outside = np.pad(occupied, 1, constant_values=True)
     axis = sum((outside != np.roll(outside, 1, k)).sum() for k in (0, 1))
-    diagonal = sum((outside[1:, 1:] != outside[:-1, :-1]).ravel()) + sum((outside[1:, :-1] != outside[:-1, 1:]).ravel())
+    diagonal = sum((outside[1:, 1:] != outside[:-1, :-1]).ravel()) + sum(
+        (outside[1:, :-1] != outside[:-1, 1:]).ravel()
+    )
     perimeter = np.pi / 8 * cell * (axis + diagonal / np.sqrt(2))
     forcing = perimeter / ((~occupied).sum() * cell**2)
     matrix = sparse.lil_matrix((occupied.size, occupied.size))
@@ -110,7 +112,10 @@ def direct(occupied: np.ndarray, cell: float) -> np.ndarray:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.tuples(st.integers(2, 30), st.integers(2, 30)), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1), st.booleans()
+    st.tuples(st.integers(2, 30), st.integers(2, 30)),
+    st.floats(0.05, 0.95),
+    st.integers(0, 2**32 - 1),
+    st.booleans(),
 )
 def test_agrees_with_a_direct_solve(shape, share, seed, blocks):
     occupied = np.random.default_rng(seed).random(shape) < share

@@ -1,0 +1,183 @@
+"""Ground removal on synthetic terrain; inflation against Euclidean distances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import distance_transform_edt
+
+from romnav.errors import RomnavError
+from romnav.safety.occupancy import Rasterizer, inflate
+from romnav.safety.spec import OccupancySpec
+
+EYE = 1.265
+"""Height of the scanner above the ground, m."""
+
+
+def patch(x: tuple[float, float], y: tuple[float, float], height, spacing: float = 0.04) -> np.ndarray:
+    """Points of a surface z = height(x) over a rectangle."""
+    xs, ys = np.meshgrid(np.arange(*x, spacing), np.arange(*y, spacing))
+    return np.stack([xs, ys, np.broadcast_to(height(xs), xs.shape)], -1).reshape(-1, 3).astype(float)
+
+
+def wall(
+    x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], spacing: float = 0.04
+) -> np.ndarray:
+    """Points of an upright rectangle between two corners."""
+    t, zs = np.meshgrid(np.linspace(0, 1, 60), np.arange(*z, spacing))
+    return np.stack([x[0] + t * (x[1] - x[0]), y[0] + t * (y[1] - y[0]), zs], -1).reshape(-1, 3)
+
+
+def visible(points: np.ndarray) -> np.ndarray:
+    """What a scanner at eye height sees ahead: 220 degrees, no steeper than 55 degrees down."""
+    d = points - [0, 0, EYE]
+    r = np.hypot(d[:, 0], d[:, 1])
+    return points[
+        (np.abs(np.arctan2(d[:, 1], d[:, 0])) < np.radians(110)) & (d[:, 2] > -np.tan(np.radians(55)) * r)
+    ]
+
+
+def rasterise(*surfaces: np.ndarray, noise: float = 0.0, spec: OccupancySpec | None = None):
+    points = visible(np.concatenate(surfaces))
+    points = points + noise * np.random.default_rng(0).normal(size=points.shape)
+    return Rasterizer(1, spec)(torch.from_numpy(points).float()[None])
+
+
+def near(grid: torch.Tensor, x: float, y: float, reach: float = 0.08) -> bool:
+    """Whether a cell within reach of a place is occupied."""
+    cells = torch.nonzero(grid[0]).double() * 0.05 - 2.975
+    return bool(len(cells)) and bool((torch.cdist(cells, torch.tensor([[x, y]]).double()) < reach).any())
+
+
+def flat(x: np.ndarray) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def stairs(first: float, riser: float, tread: float, steps: int):
+    return lambda x: riser * np.clip(np.floor((x - first) / tread) + 1, 0, steps)
+
+
+def risers(first: float, riser: float, tread: float, steps: int) -> np.ndarray:
+    low = [(k * riser, (k + 1) * riser) if riser > 0 else ((k + 1) * riser, k * riser) for k in range(steps)]
+    return np.concatenate([wall((first + k * tread,) * 2, (-1, 1), z, 0.02) for k, z in enumerate(low)])
+
+
+TERRAIN = {
+    "flat": [patch((-3, 3), (-3, 3), flat)],
+    "ramp up": [patch((-3, 3), (-3, 3), lambda x: 0.3 * np.clip(x - 1, 0, None))],
+    "ramp down": [patch((-3, 3), (-3, 3), lambda x: -0.3 * np.clip(x - 1, 0, None))],
+    "on a ramp": [patch((-3, 3), (-3, 3), lambda x: 0.36 * x)],
+    "stairs up": [patch((-3, 3), (-1, 1), stairs(1.2, 0.18, 0.28, 6)), risers(1.2, 0.18, 0.28, 6)],
+    "at the foot of stairs": [
+        patch((-3, 3), (-1, 1), stairs(0.3, 0.18, 0.26, 8)),
+        risers(0.3, 0.18, 0.26, 8),
+    ],
+    "stairs down": [patch((-3, 3), (-1, 1), stairs(0.6, -0.18, 0.28, 8))],
+    "on stairs": [patch((-3, 3), (-1, 1), lambda x: 0.17 * np.floor(x / 0.29 + 0.5))],
+    "curb and drop": [patch((-3, 3), (-3, 3), lambda x: np.where(x > 2, -1.0, np.where(x > 1.2, 0.15, 0.0)))],
+    "overhead": [patch((-3, 3), (-3, 3), flat), patch((-3, 3), (-3, 3), lambda x: 2.2 + 0 * x)],
+    "landing over a lower storey": [
+        patch((-3, 1.5), (-3, 3), flat),
+        patch((1.7, 3), (-3, 3), lambda x: -4.0 + 0 * x),
+    ],
+    "half landing below": [patch((-3, 1.2), (-3, 3), flat), patch((1.4, 3), (-3, 3), lambda x: -2.0 + 0 * x)],
+}
+
+
+@pytest.mark.parametrize("terrain", TERRAIN)
+@pytest.mark.parametrize("noise", [0.0, 0.015])
+def test_walkable_ground_is_no_obstacle(terrain, noise):
+    assert not rasterise(*TERRAIN[terrain], noise=noise).occupied.any()
+
+
+POLE = wall((1.6, 1.62), (0.3, 0.32), (0.05, 1.4))
+
+
+@pytest.mark.parametrize("terrain", ["flat", "ramp up", "ramp down", "on a ramp", "overhead"])
+def test_pole_is_an_obstacle(terrain):
+    grid = rasterise(*TERRAIN[terrain], POLE, noise=0.01).occupied
+    assert near(grid, 1.61, 0.31)
+    assert not near(grid, 1.61, -0.5, 0.4)
+
+
+def test_thin_tube_at_head_height():
+    tube = wall((1.5, 1.5), (-0.4, 0.4), (1.2, 1.23), 0.01)
+    grid = rasterise(*TERRAIN["flat"], tube).occupied
+    assert all(near(grid, 1.5, y) for y in np.linspace(-0.35, 0.35, 8))
+    assert not rasterise(*TERRAIN["flat"], tube + np.array([0, 0, 0.4])).occupied.any()
+
+
+def test_tube_where_the_floor_is_not_seen():
+    tube = wall((0.7, 0.7), (-0.3, 0.3), (1.0, 1.03), 0.01)
+    assert near(rasterise(*TERRAIN["flat"], tube).occupied, 0.7, 0.0)
+
+
+def test_walls_railings_and_tables():
+    railing = wall((1.2, 2.6), (0.9, 0.9), (0.5, 0.55), 0.02) + np.array([0, 0, 0.0])
+    sloped = railing + np.stack([0 * railing[:, 0]] * 2 + [0.64 * (railing[:, 0] - 1.2)], 1)
+    grid = rasterise(*TERRAIN["stairs up"], sloped).occupied
+    assert all(near(grid, x, 0.9) for x in np.linspace(1.3, 2.5, 7))
+    assert not near(grid, 2.0, 0.0, 0.7)
+    behind = rasterise(*TERRAIN["flat"], wall((2, 2), (-3, 3), (0, 1.4))).occupied
+    assert all(near(behind, 2.0, y) for y in np.linspace(-2.9, 2.9, 30))
+    floor = TERRAIN["flat"][0]
+    floor = floor[~((floor[:, 0] > 1.3) & (floor[:, 0] < 2.6) & (np.abs(floor[:, 1]) < 0.7))]
+    table = patch((1.4, 2.5), (-0.6, 0.6), lambda x: 0.75 + 0 * x)
+    top = rasterise(floor, table).occupied
+    assert all(near(top, x, y) for x in (1.45, 1.9, 2.4) for y in (-0.5, 0.0, 0.5))
+
+
+def test_poles_on_stairs_and_on_the_landing():
+    for x, z in ((1.9, 0.45), (2.8, 1.0)):
+        pole = wall((x, x + 0.02), (-0.4, -0.38), (z + 0.05, z + 1.2))
+        grid = rasterise(*TERRAIN["stairs up"], pole, noise=0.01).occupied
+        assert near(grid, x, -0.39)
+        assert not near(grid, x, 0.5, 0.4)
+
+
+def test_padding_and_invalid_returns_change_nothing():
+    points = torch.from_numpy(visible(np.concatenate([*TERRAIN["stairs up"], POLE]))).float()
+    plain = Rasterizer(1)(points[None])
+    padded = torch.full((2, len(points) + 50, 3), torch.nan)
+    padded[0, : len(points)] = points
+    padded[1, 50:] = points.flip(0)
+    result = Rasterizer(2)(padded, padded.isfinite().all(2))
+    assert torch.equal(result.occupied[0], plain.occupied[0])
+    assert torch.equal(result.inflated[1], plain.inflated[0])
+    assert result.used.tolist() == [len(points)] * 2
+    assert result.broken.tolist() == [0, 0]
+    padded[0, 3] = torch.nan
+    everything = torch.ones(padded.shape[:2], dtype=torch.bool)
+    assert Rasterizer(2)(padded, everything).broken.tolist() == [51, 50]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(st.integers(2, 40), st.integers(2, 40)),
+    st.floats(0, 0.2),
+    st.floats(1, 14),
+    st.integers(0, 2**32 - 1),
+)
+def test_inflation_is_the_exact_disc(shape, share, radius, seed):
+    occupied = np.random.default_rng(seed).random((2, *shape)) < share
+    for r in (radius, float(round(radius)), np.hypot(round(radius), 3)):
+        ours = inflate(torch.from_numpy(occupied), r).numpy()
+        for grid, out in zip(occupied, ours, strict=True):
+            exact = distance_transform_edt(~grid) <= r + 1e-9 if grid.any() else grid
+            np.testing.assert_array_equal(out, exact)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(RomnavError, match="smaller than occupancy"):
+        Rasterizer(1, OccupancySpec(radius=0.04))
+    with pytest.raises(RomnavError, match="is too small for a robot"):
+        Rasterizer(1, OccupancySpec(size=1.0))
+    with pytest.raises(RomnavError, match="points have shape"):
+        Rasterizer(2)(torch.zeros(1, 5, 3))
+    with pytest.raises(RomnavError, match="valid is"):
+        Rasterizer(1)(torch.zeros(1, 5, 3), torch.ones(1, 4, dtype=torch.bool))
+    with pytest.raises(RomnavError, match="expected bool"):
+        inflate(torch.zeros(4, 4), 2)
