@@ -40,8 +40,8 @@ def draw_tile(
     layers = len(tile.layers)
     columns = min(layers, 3)
     rows = -(-layers // columns)
-    figure = Figure(figsize=(6.6 + 3.0 * columns, 6.2), layout="constrained")
-    spec = figure.add_gridspec(rows, columns + 1, width_ratios=[6.6 / 3.0, *[1.0] * columns])
+    figure = Figure(figsize=(9.0 + 2.2 * columns, 6.2), layout="constrained")
+    spec = figure.add_gridspec(rows, columns + 1, width_ratios=[1.0 + 0.4 * columns, *[1.0] * columns])
     axes = figure.add_subplot(spec[:, 0])
     axes.imshow(render(tile, azimuth, elevation))
     axes.set_axis_off()
@@ -73,9 +73,9 @@ def _draw_grid(axes: Axes, tile: Tile, grids: Grids, layer: int) -> None:
             axes.plot(*connector.path[:, :2].T, color=PATH, linewidth=1.2)
             axes.plot(*connector.path[-1, :2], marker="o", markersize=3, color=PATH)
     name = f"floor {tile.storeys.index(layer)}" if layer in tile.storeys else "landings"
-    axes.set_title(f"{name}, z = {tile.layers[layer]:.1f} m", fontsize=9)
-    axes.set_xticks([0, 5, 10, 15, 20])
-    axes.set_yticks([0, 5, 10, 15, 20])
+    title = f"{name}, z = {tile.layers[layer]:.1f} m" if tile.multi_story else "occupancy"
+    axes.set_title(title, fontsize=9)
+    axes.locator_params(nbins=5)
     axes.tick_params(labelsize=7)
 
 

@@ -53,7 +53,7 @@ class Plan:
         return (WALL, self.corridor[0]) if row == 0 else (self.corridor[1], self.depth - WALL)
 
 
-def building(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
+def building(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     """A building of two to ``spec.max_storeys`` storeys."""
     plan = _draw_plan(rng, spec)
     solids = SolidsBuilder()
@@ -64,7 +64,7 @@ def building(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
     half = spec.storey_height / 2
     return Tile(
         kind=TileClass.BUILDING,
-        seed=seed,
+        seed=index,
         side=spec.side,
         solids=solids.build(),
         layers=tuple(half * k for k in range(2 * plan.storeys - 1)),

@@ -14,7 +14,7 @@ from romnav.world.tiles.stairs import MOUTH, Railing, add_flight, add_railing, d
 WALL = 0.2
 
 
-def room(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
+def room(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     """A hall of up to the tile's size, rotated, with furniture, screens and often a stage."""
     solids, floor = SolidsBuilder(), Floor(spec.side)
     most = spec.side - 0.4
@@ -46,7 +46,7 @@ def room(rng: np.random.Generator, spec: WorldSpec, seed: int) -> Tile:
     furnish(solids, rng, floor, corner, inner, 0.0, CLUTTER, count, gap=float(rng.uniform(0.75, 1.0)))
     return Tile(
         kind=TileClass.ROOM,
-        seed=seed,
+        seed=index,
         side=spec.side,
         solids=solids.build(),
         layers=(0.0,),
