@@ -1,13 +1,13 @@
 """Range images of solids in closed form.
 
 All rays of one image column share a vertical plane. In it an upright prism is a trapezoid over the horizontal
-distance t: its footprint is an interval [t0, t1], each lid a line z = a0 + a1 t. So a solid is drawn as in a
-z-buffer: find the columns between the two silhouettes of its footprint, the interval of each, the rows between the
-slopes of its edges, and in each of these pixels the larger of the entry distances of wall and lid. Every test is
-the exact one, in float32; bounds only save work.
+distance t: its footprint is an interval [t0, t1], each lid a line z = a0 + a1 t. So solids are drawn into a
+z-buffer: the columns between the silhouettes of the footprint, the rows between the slopes of the trapezoid's
+edges, and in each of these pixels the distance at which the ray has entered both footprint and lids. Bounds
+only save work, every pixel is decided by the exact test.
 
 Columns are taken `LANES` at a time as one vector, for which the compiler emits SIMD instructions on a CPU.
-Vectors have no comparison, therefore conditions are differences, scaled by `BIG` and clamped.
+Vectors have no comparisons: conditions are differences, scaled by `BIG` and clamped.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _atan2(y: float, x: float) -> float:
 
 @wp.func
 def _silhouette(solid: Solid, ou: float, ov: float) -> wp.vec4:
-    """Left and right extreme of a footprint seen from (ou, ov) outside it, relative to that point, local frame."""
+    """Leftmost and rightmost point of a footprint seen from (ou, ov) outside it, both relative to there."""
     hu = solid.half_u
     hv = solid.half_v
     if solid.cylinder != 0:
@@ -131,13 +131,13 @@ def _chord(half: float, o: float, d: Lanes):  # type: ignore[no-untyped-def]
 
 
 @wp.func
-def _disc(solid: Solid, ou: float, ov: float, du: Lanes, dv: Lanes, start: int, stop: int):  # type: ignore[no-untyped-def]
-    """Interval of distances inside a disc, for the lanes from ``start`` to ``stop``; the others are empty."""
+def _disc(radius: float, ou: float, ov: float, du: Lanes, dv: Lanes, lanes: wp.vec2i):  # type: ignore[no-untyped-def]
+    """Interval of distances inside a disc, for a range of ``lanes``; the others are empty."""
     t0 = Lanes(1.0)
     t1 = Lanes(0.0)
-    for j in range(start, stop):
+    for j in range(lanes[0], lanes[1]):
         across = ou * dv[j] - ov * du[j]
-        under = solid.half_u * solid.half_u - across * across
+        under = radius * radius - across * across
         if under > 0.0:
             middle = -ou * du[j] - ov * dv[j]
             t0[j] = middle - wp.sqrt(under)
@@ -211,7 +211,9 @@ def _draw(
         t0 = Lanes(0.0)
         t1 = Lanes(0.0)
         if solid.cylinder != 0:
-            t0, t1 = _disc(solid, ou, ov, du, dv, wp.max(first - c, 0), wp.min(last + 1 - c, LANES))
+            t0, t1 = _disc(
+                solid.half_u, ou, ov, du, dv, wp.vec2i(wp.max(first - c, 0), wp.min(last + 1 - c, LANES))
+            )
         else:
             u0, u1 = _chord(solid.half_u, ou, du)
             v0, v1 = _chord(solid.half_v, ov, dv)
@@ -325,10 +327,13 @@ def cast_rays(
     ranges: wp.array3d(dtype=float),
     labels: wp.array3d(dtype=float),
 ):
-    """Cast one ray at the triangles of its tile; a face hit from behind means that the ray starts in a solid."""
+    """Cast one ray at the triangles of its tile; a face hit from behind says that it starts in a solid."""
     env, row, column = wp.tid()
-    direction = wp.quat_rotate(wp.quat_rpy(0.0, 0.0, yaw[env]), directions[row, column])
-    hit = wp.mesh_query_ray(meshes[tile[env]], origin[env], direction, max_range)
+    cos = wp.cos(yaw[env])
+    sin = wp.sin(yaw[env])
+    d = directions[row, column]
+    ray = wp.vec3(cos * d[0] - sin * d[1], sin * d[0] + cos * d[1], d[2])
+    hit = wp.mesh_query_ray(meshes[tile[env]], origin[env], ray, max_range)
     ranges[env, row, column] = wp.where(hit.result, wp.where(hit.sign > 0.0, hit.t, 0.0), BIG)
     if labels and hit.result:
         labels[env, row, column] = float(label[first[tile[env]] + hit.face])
@@ -347,7 +352,7 @@ def finish(
 
 
 def lanes(tensor: Tensor) -> Any:
-    """Overlapping view of a float32 tensor: element ``[..., c]`` is the vector of its columns c to c + LANES - 1."""
+    """View of a float32 tensor: element ``[..., c]`` is the vector of its columns c to c + LANES - 1."""
     return wp.array(
         ptr=tensor.data_ptr(),
         dtype=Lanes,

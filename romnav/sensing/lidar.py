@@ -25,8 +25,8 @@ class Lidar:
     edge to the right one, each pixel one ray through its centre. How the sensor is mounted and tilted only
     decides which pixels lie in its field of view; the others have no return.
 
-    A ray that starts inside a solid hits it at distance 0, hence has no return. Solids may extend beyond their
-    tile; where there are none, there is no return.
+    A ray that starts inside a solid hits it at distance 0, hence has no return. Solids may extend beyond
+    their tile; a ray that meets none has no return.
 
     Args:
         solids: The solids of each tile.

@@ -14,8 +14,8 @@ class LidarSpec(Config):
 
     rows: int = Field(default=59, ge=1)
     """Pixels in elevation; 59 are 1 degree each (P)."""
-    columns: int = Field(default=220, ge=1)
-    """Pixels in azimuth; 220 are 1 degree each (P)."""
+    columns: int = Field(default=220, ge=16)
+    """Pixels in azimuth; 220 are 1 degree each (P). At least the width of a vector."""
     azimuth: float = Field(default=220.0, gt=0.0, le=360.0)
     """Horizontal field, centred on the forward direction, degrees (P)."""
     elevation: tuple[float, float] = (-55.0, 4.0)
