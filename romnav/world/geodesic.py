@@ -326,6 +326,8 @@ class Geodesics:
     """(G, C) planar distance of each corner to the goal, m; infinite where no shortest path bends."""
     corner: NDArray[np.float32]
     """(C, 2) position of each corner, m."""
+    outward: NDArray[np.float32]
+    """(C, 2) signs of x and y away from the occupied cell of each corner."""
 
 
 def fields(grids: Grids, goals: NDArray[np.integer]) -> NDArray[np.uint16]:
@@ -391,7 +393,7 @@ def solve(
         run(0, workers)
     ends = np.cumsum(counts)[:-1]
     return [
-        Geodesics(*(part.reshape(count, -1) for part in parts), _corner_positions(surface) * s.half)
+        Geodesics(*(part.reshape(count, -1) for part in parts), *_corners(surface, s.half))
         for count, surface, *parts in zip(
             counts,
             surfaces,
@@ -456,11 +458,12 @@ def _stretch(joined: NDArray[np.bool_]) -> NDArray[np.intp]:
     return ends[np.searchsorted(ends, np.arange(len(joined) + 1))]
 
 
-def _corner_positions(surface: dict[str, NDArray[np.int32]]) -> NDArray[np.float32]:
-    """(C, 2) x and y of the corners, half cells."""
+def _corners(surface: dict[str, NDArray[np.int32]], half: float) -> tuple[NDArray[np.float32], ...]:
+    """`Geodesics.corner` and `Geodesics.outward`."""
     side = surface["corner_side"]
-    yx = surface["xy"][surface["corner_node"]] + np.stack([2 * (side & 1) - 1, (side & 2) - 1], axis=1)
-    return yx[:, ::-1].astype(np.float32)
+    inward = np.stack([(side & 2) - 1, 2 * (side & 1) - 1], axis=1)
+    position = (surface["xy"][surface["corner_node"], ::-1] + inward) * half
+    return position.astype(np.float32), -inward.astype(np.float32)
 
 
 @wp.struct
@@ -472,6 +475,7 @@ class Paths:
     reach: wp.array[wp.float32]
     reach_offset: wp.array[wp.int64]
     corner: wp.array[wp.vec2]
+    outward: wp.array[wp.vec2]
     corner_offset: wp.array[wp.int64]
     goal: wp.array[wp.vec2]
     position: wp.array[wp.vec2]
@@ -480,13 +484,14 @@ class Paths:
 
 
 @wp.func
-def bend(paths: Paths, goal: wp.int64, node: wp.int64):
-    """First bend of the path from ``node`` (x, y), and its distance from the goal, m."""
+def bend(paths: Paths, goal: wp.int64, node: wp.int64, clearance: float):
+    """Where the path from ``node`` first bends (x, y), ``clearance`` off the corner; its distance to the goal."""
     source = wp.int64(paths.source[paths.source_offset[goal] + node])
     if source == wp.int64(65535):
         return wp.vec3(paths.goal[goal][0], paths.goal[goal][1], 0.0)
-    corner = paths.corner[paths.corner_offset[goal] + source]
-    return wp.vec3(corner[0], corner[1], paths.reach[paths.reach_offset[goal] + source])
+    corner = paths.corner_offset[goal] + source
+    at = paths.corner[corner] + clearance * paths.outward[corner]
+    return wp.vec3(at[0], at[1], paths.reach[paths.reach_offset[goal] + source])
 
 
 @wp.kernel
@@ -537,11 +542,12 @@ def look(
             n = wp.int64(diagonal)
             weight = u * v
         if n >= wp.int64(0):
-            end = bend(paths, g, n)
+            end = bend(paths, g, n, 0.0)
             total += weight * (end[2] + wp.length(p - wp.vec2(end[0], end[1])))
             weights += weight
     distance[e] = total / weights
-    end = bend(paths, g, node)
+    # past the corner, not at it: there the heading would be into the face of the occupied cell
+    end = bend(paths, g, node, 0.05 * paths.cell)
     direction[e] = wp.normalize(wp.vec2(end[0], end[1]) - p)
 
 
@@ -571,6 +577,7 @@ class GeodesicLookup:
             ("reach", np.concatenate([p.reach.ravel() for p in solved]), wp.float32),
             ("reach_offset", np.cumsum(count) - count, wp.int64),
             ("corner", np.concatenate([p.corner for p in solved]), wp.vec2),
+            ("outward", np.concatenate([p.outward for p in solved]), wp.vec2),
             ("corner_offset", corners[tile], wp.int64),
             ("goal", position[world.goal.cpu().numpy()], wp.vec2),
             ("position", position, wp.vec2),
