@@ -81,6 +81,7 @@ class NavigationEnv(VecEnv):
         self._command = torch.zeros(count, ACTIONS, device=device)
         self._best = torch.zeros(count, 2, device=device)
         self._since_arrival = torch.full((count,), -1, **long)
+        self._since_best = torch.zeros(count, **long)
         self._cross = torch.zeros(count, dtype=torch.bool, device=device)
         self._finished = torch.zeros(4, dtype=torch.float64, device=device)
         self._reward_sums = torch.zeros(8, dtype=torch.float64, device=device)
@@ -120,6 +121,7 @@ class NavigationEnv(VecEnv):
         "_command",
         "_best",
         "_since_arrival",
+        "_since_best",
         "_cross",
         "_finished",
         "_reward_sums",
@@ -172,7 +174,8 @@ class NavigationEnv(VecEnv):
         self._since_arrival = torch.where(waiting | here, self._since_arrival + 1, self._since_arrival)
         fallen = self.dynamics.fallen.clone()
         stayed = self._since_arrival * self.spec.period >= self.spec.stay
-        timeout = ((self.episode_length_buf >= self.max_episode_length) | stayed) & ~fallen
+        stalled = (self._since_best * self.spec.period >= self.spec.patience) & (self._since_arrival < 0)
+        timeout = ((self.episode_length_buf >= self.max_episode_length) | stayed | stalled) & ~fallen
         done = timeout | fallen
         self._count(done)
         ended = done.nonzero()[:, 0]
@@ -220,6 +223,8 @@ class NavigationEnv(VecEnv):
         values = terms(step, self.spec.reward, self.spec.period)
         scale = weights(self.spec.reward, self.progress)
         weighted = torch.stack([scale[name] * values[name] for name in scale])
+        nearer = self._geodesic < self._best[:, 0]
+        self._since_best = torch.where(nearer, 0, self._since_best + 1)
         self._best = torch.minimum(self._best, torch.stack([self._geodesic, height], dim=1))
         self._reward_sums += weighted.mean(dim=1).double()
         self._reward_steps += 1
@@ -247,6 +252,7 @@ class NavigationEnv(VecEnv):
         self._goal_yaw[envs] = start.goal_yaw
         self._command[envs] = 0.0
         self._since_arrival[envs] = -1
+        self._since_best[envs] = 0
         self.episode_length_buf[envs] = 0
         self._geodesic, self._direction = self._measure()
         height = (self._goal_position - d.position)[envs, 2].abs()

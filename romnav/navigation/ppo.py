@@ -102,6 +102,7 @@ def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, devi
         "value_loss_coef": spec.value,
         "entropy_coef": spec.entropy,
         "max_grad_norm": spec.max_grad_norm,
+        "use_clipped_value_loss": False,
         "desired_kl": spec.desired_kl,
         "learning_rate": spec.learning_rate,
     }

@@ -64,6 +64,9 @@ class EnvSpec(Config):
     stay: float = 45.0
     """An episode is truncated, not ended, this long after the goal was first reached, s (P: never, it runs on to
     ``duration``; A: short runs use a few seconds and spend the steps on new goals)."""
+    patience: float = 45.0
+    """An episode is truncated, not ended, after this long without coming nearer to the goal than ever before, s (P:
+    never; A: progress is measured along the shortest path, so short runs lose little by starting over)."""
     reach: float = 0.5
     """Distance in 3D that counts as arrival, m (P)."""
     max_goal_distance: float = 30.0

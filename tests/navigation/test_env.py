@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from romnav.navigation.env import NavigationEnv, to_command
+from romnav.navigation.spec import CommandSpec, EnvSpec, NavigationSpec
+from romnav.robot.rom import ReducedOrderModel
+from romnav.world.spawns import Start
+from romnav.world.world import World
+
+
+def make(world: World, perception: object, spec: EnvSpec, seed: int = 3) -> NavigationEnv:
+    return NavigationEnv(world, ReducedOrderModel(world, spec.envs, spec.period), perception, spec, seed, "cpu")
+
+
+def actions(envs: int, step: int) -> torch.Tensor:
+    return torch.rand(envs, 3, generator=torch.Generator().manual_seed(step)) * 2 - 1
+
+
+def test_command_limits_are_the_papers() -> None:
+    corner = torch.tensor([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0], [0.0, 0.0, 0.0]])
+    expected = [[1.0, 0.25, 1.0], [-0.5, -0.25, -1.0], [0.0, 0.0, 0.0]]
+    assert to_command(corner, CommandSpec()).tolist() == expected
+
+
+def test_same_seed_same_run(world: World, perception: object, spec: NavigationSpec) -> None:
+    one, two = (make(world, perception, spec.env) for _ in range(2))
+    for step in range(30):
+        a, b = one.step(actions(12, step)), two.step(actions(12, step))
+        assert torch.equal(a[1], b[1])
+        for key in a[0].keys():
+            assert torch.equal(a[0][key], b[0][key])
+
+
+def test_environments_are_independent_of_their_number(
+    world: World, perception: object, spec: NavigationSpec
+) -> None:
+    """Environment 3 of 12 lives the same life as environment 3 of 5, resets included."""
+    few = spec.env.model_copy(update={"envs": 5})
+    large, small = make(world, perception, spec.env), make(world, perception, few)
+    for step in range(40):
+        a = actions(12, step)
+        obs_a, reward_a, done_a, _ = large.step(a)
+        obs_b, reward_b, done_b, _ = small.step(a[:5])
+        assert torch.equal(done_a[:5], done_b)
+        torch.testing.assert_close(reward_a[:5], reward_b)
+        torch.testing.assert_close(obs_a["critic"][:5], obs_b["critic"])
+
+
+def test_restored_environment_goes_on_as_if_never_stopped(
+    world: World, perception: object, spec: NavigationSpec
+) -> None:
+    env, other = make(world, perception, spec.env), make(world, perception, spec.env, seed=3)
+    for step in range(10):
+        env.step(actions(12, step))
+    other.load_state_dict(env.state_dict())
+    for key, value in env.get_observations().items():
+        assert torch.equal(value, other.get_observations()[key])
+    for step in range(10, 30):
+        a, b = env.step(actions(12, step)), other.step(actions(12, step))
+        assert torch.equal(a[1], b[1])
+        assert torch.equal(a[0]["state"], b[0]["state"])
+    assert repr(env.statistics()) == repr(other.statistics())
+
+
+def test_timeouts_are_truncations_at_the_episode_length(
+    world: World, perception: object, spec: NavigationSpec
+) -> None:
+    env = make(world, perception, spec.env.model_copy(update={"stay": 100.0}))
+    env.episode_length_buf[:] = 0
+    for step in range(1, 21):
+        _, _, done, extras = env.step(torch.zeros(12, 3))
+        assert bool(done.all()) == (step == 20)  # 4 s at 5 Hz
+        assert torch.equal(done, extras["time_outs"])
+    assert env.episode_length_buf.eq(0).all()
+
+
+def test_arrival_is_counted_and_truncated_after_the_stay(
+    world: World, perception: object, spec: NavigationSpec
+) -> None:
+    env = make(world, perception, spec.env)
+    env.episode_length_buf[:] = 0
+    env.statistics()
+    everyone = torch.arange(12)
+    goal = torch.zeros(12, dtype=torch.int64)
+    target = world.position[world.goal[0]].expand(12, 3)
+    # start on top of the goal of the first tile
+    env._start(
+        everyone,
+        Start(
+            tile=torch.zeros(12, dtype=torch.int64),
+            layer=world.layer[world.goal[goal]],
+            xy=target[:, :2].clone(),
+            yaw=torch.zeros(12),
+            goal=goal,
+            goal_yaw=torch.zeros(12),
+        ),
+    )
+    ended = [int(env.step(torch.zeros(12, 3))[2].sum()) for _ in range(6)]
+    assert ended == [0, 0, 0, 0, 0, 12]  # reached in the first step, then 1 s at 5 Hz
+    statistics = env.statistics()
+    assert (statistics.episodes, statistics.success) == (12, 1.0)
+
+
+def test_reward_statistics_add_up(world: World, perception: object, spec: NavigationSpec) -> None:
+    env = make(world, perception, spec.env)
+    env.statistics()
+    total = sum(env.step(actions(12, step))[1].mean().item() for step in range(5))
+    assert sum(env.statistics().reward.values()) == pytest.approx(total / 5, rel=1e-4)
