@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from romnav.world.solids import Label, SolidsBuilder
@@ -11,6 +11,7 @@ angle = st.floats(-7.0, 7.0)
 coordinate = st.floats(-20.0, 20.0)
 
 
+@settings(deadline=None)
 @given(angle, coordinate, coordinate, st.floats(0.1, 5.0), st.floats(0.1, 5.0))
 def test_corners_are_the_local_half_extents_turned_counter_clockwise(
     yaw: float, x: float, y: float, length: float, width: float
@@ -27,6 +28,7 @@ def test_corners_are_the_local_half_extents_turned_counter_clockwise(
     np.testing.assert_allclose(area, length * width, rtol=1e-6)
 
 
+@settings(deadline=None)
 @given(coordinate, coordinate, coordinate, coordinate, st.floats(-2.0, 2.0))
 def test_a_segment_runs_from_start_to_end_and_rises(
     x0: float, y0: float, x1: float, y1: float, rise: float

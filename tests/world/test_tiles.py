@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from romnav.errors import RomnavError
@@ -190,6 +190,7 @@ def test_impossible_specs_are_reported() -> None:
 span = st.tuples(st.integers(0, 9), st.integers(1, 9)).map(lambda t: (float(t[0]), float(t[0] + t[1])))
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(span, span), max_size=4))
 def test_cut_covers_exactly_what_is_left(holes: list) -> None:
     parts = cut(((2.0, 12.0), (1.0, 14.0)), holes)
