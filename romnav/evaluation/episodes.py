@@ -22,6 +22,7 @@ from romnav.world.spec import WorldSpec
 from romnav.world.world import World, build
 
 VERSION = 1
+ATTEMPTS = 20
 COLUMNS = (
     ("tile", 0),
     ("layer", 0),
@@ -84,10 +85,17 @@ def draw(name: str, spec: EpisodeSetSpec, world: World) -> EpisodeSet:
     """Draw a set on ``world``, built from ``spec.world``: tiles in turn, the sampler's spawns and goals."""
     episode = torch.arange(spec.episodes)
     tile = episode % len(world.tiles)
-    start = sample(world, spec.sampler, spec.seed, tile, episode, torch.zeros_like(episode))
+    attempt = torch.zeros_like(episode)
+    # a spawn may have no goal within the cap: draw it again until it has
+    for _ in range(ATTEMPTS):
+        start = sample(world, spec.sampler, spec.seed, tile, episode, attempt)
+        spawn_node = world.node_at(start.tile, start.layer, start.xy)
+        offset = world.field_start[start.goal] + spawn_node - world.node_start[start.tile]
+        beyond = world.fields[offset].to(torch.float64) * UNIT > spec.sampler.max_distance
+        attempt += beyond
+    if beyond.any():
+        raise RomnavError(f"{name}: a tile has no goal within {spec.sampler.max_distance} m; raise goals_per_tile")
     goal = world.position[world.goal[start.goal]]
-    spawn_node = world.node_at(start.tile, start.layer, start.xy)
-    offset = world.field_start[start.goal] + spawn_node - world.node_start[start.tile]
     values = {
         "tile": start.tile,
         "layer": start.layer,

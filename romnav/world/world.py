@@ -107,8 +107,9 @@ def build(
     if path and path.exists():
         try:
             with path.open("rb") as file:
-                return pickle.load(file)
-        except (pickle.UnpicklingError, EOFError, AttributeError, ImportError):
+                stored = pickle.load(file)
+            return World(**{k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in stored.items()})
+        except (pickle.UnpicklingError, EOFError):
             path.unlink()
     tiles, grids, goals = [], [], []
     for i in range(spec.tiles):
@@ -122,8 +123,10 @@ def build(
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(f".{os.getpid()}.tmp")
+        # as arrays: torch does not unpickle its own unsigned 16-bit tensors
+        stored = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in world.__dict__.items()}
         with temporary.open("wb") as file:
-            pickle.dump(world, file, protocol=5)
+            pickle.dump(stored, file, protocol=5)
         temporary.replace(path)
     return world
 

@@ -41,7 +41,8 @@ def solve_qp(
 
 
 def test_a_million_programs_agree_with_enumerated_active_sets():
-    """Every candidate of the box program: the box's nearest point, the foot, and the line's cuts with the sides."""
+    """Every candidate of the box program: the box's nearest point, the foot, and the line's cuts with the
+    sides."""
     desired, normal, bound = qp_cases(1_000_000, 0)
     v, feasible = solve_qp(desired, normal, bound, box=True)
     low, high = np.array(LOWER), np.array(UPPER)
@@ -145,7 +146,8 @@ def starts(h: np.ndarray, inside: bool, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("box", [False, True])
 def test_integrator_never_enters_an_obstacle(box):
-    """Thousands of worlds, robots pushed in a direction that changes every few seconds, h watched between samples."""
+    """Thousands of worlds, robots pushed in a direction that changes every few seconds, h watched between
+    samples."""
     robots, n = 2000, 32
     spec = FilterSpec(box=box)
     grids = worlds(robots, n, 0)
@@ -219,7 +221,8 @@ def test_safe_commands_pass_and_others_move_least(seed, speed, angle):
     safe = (rate > -spec.alpha * value + 1e-3) & (path.min(1) > 0.51 * value) & stays
     assert (v == desired)[safe].all()
     assert (out.status.numpy() == Status.UNCHANGED)[safe].all()
-    # A projection onto a half-plane that holds zero, then a scaling: v lies in the ball over the desired velocity.
+    # A projection onto a half-plane that holds zero, then a scaling: v lies in the ball over the desired
+    # velocity.
     assert ((v * (desired - v)).sum(1) >= -1e-9).all()
 
 
@@ -277,7 +280,8 @@ def test_passes_a_gap_of_three_cells():
 
 
 def test_positive_h_proves_that_the_disc_is_clear():
-    """Whatever the rounding of points to cells: h > 0 means every point is farther than the robot's radius."""
+    """Whatever the rounding of points to cells: h > 0 means every point is farther than the robot's
+    radius."""
     spec = OccupancySpec(size=4.0)
     rng = np.random.default_rng(0)
     half = spec.size / 2

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from romnav.errors import RomnavError
+from romnav.evaluation import episodes
+from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.spec import EpisodeSetSpec
+from romnav.world.spec import SamplerSpec, WorldSpec
+from romnav.world.world import World, build
+
+SPEC = EpisodeSetSpec(
+    world=WorldSpec(tiles=3, seed=41, goals_per_tile=8),
+    episodes=48,
+    sampler=SamplerSpec(stair_probability=0.0),
+)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return build(SPEC.world)
+
+
+@pytest.fixture(scope="module")
+def drawn(world: World) -> EpisodeSet:
+    return episodes.draw("test", SPEC, world)
+
+
+def test_drawn_saved_and_read_are_one_set(drawn: EpisodeSet, world: World, tmp_path: Path) -> None:
+    episodes.save(tmp_path / "test.json", drawn)
+    read = episodes.load(tmp_path / "test.json")
+    assert read.digest == drawn.digest
+    for key, column in drawn.columns.items():
+        assert np.array_equal(column, read.columns[key])
+    assert len(read) == 48
+    assert 0.2 < read.cross.mean() < 0.9
+    assert (read.columns["geodesic"] <= 30.0).all()
+    episodes.terrain(read, tmp_path / "test.json", None)
+
+
+def test_hash_names_terrain_and_episodes(drawn: EpisodeSet) -> None:
+    moved = {**drawn.columns, "spawn_x": drawn.columns["spawn_x"] + 0.001}
+    assert EpisodeSet("test", drawn.world, moved).digest != drawn.digest
+    other = drawn.world.model_copy(update={"seed": 42})
+    assert EpisodeSet("test", other, drawn.columns).digest != drawn.digest
+
+
+def test_edited_set_is_refused(drawn: EpisodeSet, tmp_path: Path) -> None:
+    path = tmp_path / "test.json"
+    episodes.save(path, drawn)
+    data = json.loads(path.read_text())
+    data["goal_x"][3] += 1.0
+    path.write_text(json.dumps(data))
+    with pytest.raises(RomnavError, match=r"test\.json: key 'hash' is \w+, but the content hashes to"):
+        episodes.load(path)
+
+
+def test_torn_and_missing_sets(drawn: EpisodeSet, tmp_path: Path) -> None:
+    path = tmp_path / "test.json"
+    episodes.save(path, drawn)
+    path.write_text(path.read_text()[:500])
+    with pytest.raises(RomnavError, match="not an episode set"):
+        episodes.load(path)
+    with pytest.raises(RomnavError, match="no such episode set; there are: test"):
+        episodes.load(tmp_path / "other.json")
+
+
+def test_goal_in_a_wall_is_found(drawn: EpisodeSet, world: World, tmp_path: Path) -> None:
+    """A set that does not fit its terrain, as after a change of the generator, is refused whole."""
+    wrong = EpisodeSet("test", drawn.world, {**drawn.columns, "spawn_x": np.full(48, 0.05)})
+    with pytest.raises(RomnavError, match="episode 0 does not fit its terrain .* drawn by another world generator"):
+        episodes.terrain(wrong, tmp_path / "test.json", None)
+
+
+def test_the_shipped_set(tmp_path: Path) -> None:
+    """The paired set of the tables fits today's generator, on terrain of another seed than training."""
+    path = Path(__file__).parents[2] / "experiments" / "episodes" / "paired-1.json"
+    paired = episodes.load(path)
+    assert len(paired) == 1024
+    assert paired.world.seed != WorldSpec().seed
+    episodes.terrain(paired, path, None)

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from romnav.evaluation import episodes
+from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.rollout import Oracle, Policy, Straight, View, evaluate
+from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
+from romnav.navigation.ppo import make_actor
+from romnav.navigation.spec import EnvSpec, PolicySpec
+from romnav.world.spec import SamplerSpec, WorldSpec
+from romnav.world.world import World, build
+from tests.navigation.conftest import TOKENS, FakePerception
+
+SPEC = EpisodeSetSpec(
+    world=WorldSpec(tiles=8, seed=51, goals_per_tile=16),
+    episodes=160,
+    sampler=SamplerSpec(stair_probability=0.0),
+)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return build(SPEC.world)
+
+
+@pytest.fixture(scope="module")
+def paired(world: World) -> EpisodeSet:
+    return episodes.draw("test", SPEC, world)
+
+
+def policy() -> Policy:
+    torch.manual_seed(0)
+    obs = TensorDict({"lidar": torch.zeros(1, *TOKENS), "state": torch.zeros(1, 9)}, batch_size=[1])
+    return Policy(make_actor(obs, PolicySpec(attention=16, recurrent=16)), FakePerception())
+
+
+def test_oracle_reaches_nearly_every_goal_by_nearly_the_shortest_path(world: World, paired: EpisodeSet) -> None:
+    out = evaluate(Oracle(), world, paired, EnvSpec(), EvaluationSpec())
+    success = out["outcome"] == "success"
+    geodesic = paired.columns["geodesic"]
+    spl = np.mean(success * geodesic / np.maximum(geodesic, out["path_length"]))
+    assert success.mean() >= 0.99
+    assert spl >= 0.95
+    # it can be no shorter than the geodesic but for the radius of arrival and the lattice
+    assert (out["path_length"][success] >= 0.97 * geodesic[success] - 0.75).all()
+    assert (out["success_time"][success] >= out["path_length"][success] / np.hypot(1.0, 0.25) - 0.2).all()
+    assert np.nanmax(out["success_time"]) <= 45.0
+
+
+def test_straight_is_the_lower_bound(world: World, paired: EpisodeSet) -> None:
+    straight = evaluate(Straight(), world, paired, EnvSpec(), EvaluationSpec())["outcome"] == "success"
+    assert straight[~paired.cross].mean() > 0.25  # some goals lie in plain sight
+    assert straight[paired.cross].mean() < 0.3
+
+
+def test_two_evaluations_give_the_same_rows_at_any_thread_count(world: World, paired: EpisodeSet) -> None:
+    threads = torch.get_num_threads()
+    short = EvaluationSpec(duration=20.0)
+    try:
+        runs = []
+        for count in (1, 1, 2):
+            torch.set_num_threads(count)
+            runs.append(evaluate(policy(), world, paired, EnvSpec(), short))
+    finally:
+        torch.set_num_threads(threads)
+    for other in runs[1:]:
+        for key, column in runs[0].items():
+            assert np.array_equal(column, other[key], equal_nan=column.dtype.kind == "f"), key
+
+
+def test_memory_follows_its_episode_when_finished_ones_are_dropped(world: World, paired: EpisodeSet) -> None:
+    """Dropping rows must not change what the remaining ones do."""
+
+    half = torch.arange(0, 160, 2)
+    view, part = View(world, paired, EnvSpec()), View(world, paired, EnvSpec())
+    whole_driver, part_driver = policy(), policy()
+    for step in range(20):
+        if step == 5:
+            part.select(half)
+            part_driver.select(half)
+        for v, d in ((view, whole_driver), (part, part_driver)):
+            with torch.inference_mode():
+                command = d.command(v)
+            v.robot.step(command)
+            v.previous, v.step = command, step + 1
+    torch.testing.assert_close(view.robot.position[half], part.robot.position, atol=1e-4, rtol=0)
+
+
+def test_measures_of_a_robot_that_stands_still(world: World, paired: EpisodeSet) -> None:
+    class Still:
+        def command(self, view: View) -> torch.Tensor:
+            return torch.zeros(len(view.episode), 3)
+
+        def select(self, keep: torch.Tensor) -> None:
+            pass
+
+    out = evaluate(Still(), world, paired, EnvSpec(), EvaluationSpec(duration=2.0))
+    assert (out["outcome"] == "timeout").all()
+    assert np.isnan(out["success_time"]).all()
+    assert (out["time"] == 2.0).all()
+    assert (out["path_length"] == 0.0).all()
+    assert (out["collisions"] == 0).all()
+    np.testing.assert_allclose(out["final_distance"], paired.columns["geodesic"], atol=0.15)

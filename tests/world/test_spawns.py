@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from romnav.world.geodesic import UNIT, fields
+from romnav.world.spawns import LEVEL_GAP, Start, sample
+from romnav.world.spec import SamplerSpec, WorldSpec
+from romnav.world.world import MOUTH_RADIUS, World, build
+
+COUNT = 6000
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return build(WorldSpec(tiles=8, seed=21, goals_per_tile=20))
+
+
+def draw(world: World, spec: SamplerSpec, seed: int = 1) -> Start:
+    env = torch.arange(COUNT)
+    return sample(world, spec, seed, env % len(world.tiles), env, torch.zeros_like(env))
+
+
+def facts(world: World, start: Start) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Spawn node, goal node and geodesic, the last recomputed from the goal's own field."""
+    spawn = world.node_at(start.tile, start.layer, start.xy)
+    goal = world.goal[start.goal]
+    geodesic = torch.zeros(COUNT)
+    for t, grids in enumerate(world.grids):
+        here = (start.tile == t).nonzero()[:, 0]
+        local = goal[here] - world.node_start[t]
+        unique, inverse = np.unique(local.numpy(), return_inverse=True)
+        field = fields(grids, unique)[inverse, (spawn[here] - world.node_start[t]).numpy()]
+        geodesic[here] = torch.from_numpy(field.astype(np.float32)) * UNIT
+    return spawn, goal, geodesic
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.3])
+@pytest.mark.parametrize("cap", ["geodesic", "euclidean"])
+def test_the_four_samplers(world: World, probability: float, cap: str) -> None:
+    spec = SamplerSpec(stair_probability=probability, cap=cap)
+    start = draw(world, spec)
+    spawn, goal, geodesic = facts(world, start)
+    assert (spawn >= 0).all()
+    assert torch.equal(torch.searchsorted(world.node_start, goal, right=True) - 1, start.tile)
+    assert geodesic.min() >= spec.min_distance
+    if cap == "geodesic":
+        assert geodesic.max() <= spec.max_distance
+    else:
+        assert geodesic.max() > spec.max_distance
+        offset = world.position[goal] - world.position[spawn]
+        assert torch.linalg.vector_norm(offset, dim=1).max() <= spec.max_distance
+    on_stair = torch.isin(spawn, world.spawn)
+    share = torch.tensor([(world.spawn_start[t + 1] - world.spawn_start[t]) for t in range(8)]) / world.node_start.diff()
+    has = world.spawn_start.diff() > 0
+    expected = torch.where(has, probability + (1 - probability) * share, 0.0).mean().item()
+    assert on_stair.float().mean().item() == pytest.approx(expected, abs=0.025)
+
+
+def test_cross_level_shares(world: World) -> None:
+    start = draw(world, SamplerSpec())
+    spawn, goal, _ = facts(world, start)
+    cross = (world.position[spawn, 2] - world.position[goal, 2]).abs() > LEVEL_GAP
+    for t, tile in enumerate(world.tiles):
+        here = start.tile == t
+        share = cross[here].float().mean().item()
+        levels = world.position[world.goal[world.goal_start[t] : world.goal_start[t + 1]], 2]
+        if len(tile.storeys) == 3:
+            # always, but for spawns with no goal of another level within the cap
+            assert share > 0.9
+        elif levels.max() - levels.min() > LEVEL_GAP:
+            assert share == pytest.approx(0.5, abs=0.12)
+        else:
+            assert share <= 0.5  # only stair spawns differ in height from their goals
+
+
+def test_stair_spawns_are_on_or_at_the_mouth_of_a_connector(world: World) -> None:
+    for t, (tile, grids) in enumerate(zip(world.tiles, world.grids, strict=True)):
+        local = world.spawn[world.spawn_start[t] : world.spawn_start[t + 1]] - world.node_start[t]
+        chosen = np.zeros(len(grids.position), bool)
+        chosen[local] = True
+        assert (chosen | ~grids.connector).all()
+        mouths = [c.path[i] for c in tile.connectors for i in (0, -1)]
+        for p in grids.position[chosen & ~grids.connector]:
+            assert min(np.hypot(*(p - m)[:2]) for m in mouths) < MOUTH_RADIUS
+
+
+def test_a_draw_depends_on_seed_environment_and_episode_alone(world: World) -> None:
+    whole = draw(world, SamplerSpec())
+    some = torch.tensor([5, 999, 17])
+    part = sample(world, SamplerSpec(), 1, some % 8, some, torch.zeros_like(some))
+    assert torch.equal(whole.xy[some], part.xy)
+    assert torch.equal(whole.goal[some], part.goal)
+    other = draw(world, SamplerSpec(), seed=2)
+    assert (whole.goal != other.goal).float().mean() > 0.8
+
+
+def test_goals_of_a_class_are_drawn_evenly(world: World) -> None:
+    """Every qualifying goal is as likely as any other: chi-squared of one spawn's goals on a one-level room."""
+    room = next(t for t, tile in enumerate(world.tiles) if tile.kind == "room")
+    env = torch.arange(40_000)
+    start = sample(world, SamplerSpec(stair_probability=0.0), 3, torch.full_like(env, room), env, torch.zeros_like(env))
+    counts = torch.bincount(start.goal - world.goal_start[room], minlength=20)
+    # nearness masks differ by spawn, so goals differ a little; none may be starved or favoured
+    assert counts.min() > 0.5 * counts.float().mean()
+    assert counts.max() < 2.0 * counts.float().mean()
