@@ -50,13 +50,9 @@ app.add_typer(play, name="play")
 ScaleOption = Annotated[
     str, typer.Option("--scale", help="smoke (minutes), cpu (hours) or paper (the paper's numbers, GPU).")
 ]
-SeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Training seed; default: those of the experiment.")
-]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Training seed; default: those of the experiment.")]
 DeviceOption = Annotated[str, typer.Option("--device", help="cpu, cuda or cuda:N.")]
-ResumeOption = Annotated[
-    bool, typer.Option("--resume/--no-resume", help="Go on from what is there, or start over.")
-]
+ResumeOption = Annotated[bool, typer.Option("--resume/--no-resume", help="Go on from what is there, or start over.")]
 
 
 @app.callback()
@@ -135,9 +131,7 @@ def evaluate(
     from romnav.experiment.run import require_trained
 
     plan = _plan(ctx, scale)
-    stages = [
-        plan.episodes(arm, s) for arm in arms for s in (plan.project.seeds(arm) if seed is None else (seed,))
-    ]
+    stages = [plan.episodes(arm, s) for arm in arms for s in (plan.project.seeds(arm) if seed is None else (seed,))]
     require_trained(stages)
     _execute(plan, stages, device, resume, {"episodes"})
     _print_results(_collect(ctx, scale), arms, paired)

@@ -79,9 +79,7 @@ class Policy:
     def command(self, view: View) -> Tensor:
         """(A, 3) velocity command."""
         r = view.robot
-        goal = goal_observation(
-            r.position, r.yaw, view.goal_position, view.goal_yaw, view.env.max_goal_distance
-        )
+        goal = goal_observation(r.position, r.yaw, view.goal_position, view.goal_yaw, view.env.max_goal_distance)
         counters = torch.stack([view.episode, torch.full_like(view.episode, view.step)], dim=1)
         obs = TensorDict(
             {

@@ -161,9 +161,7 @@ def _check(c: Mapping[str, NDArray], source: str) -> None:
     for name, ok in holds.items():
         if not np.all(ok):
             worst = int(np.argmin(ok))
-            raise RomnavError(
-                f"{source}: episode {worst} has an impossible {name} ({c[name][worst]}); evaluate again"
-            )
+            raise RomnavError(f"{source}: episode {worst} has an impossible {name} ({c[name][worst]}); evaluate again")
 
 
 def _some(ids: NDArray) -> str:
@@ -236,8 +234,7 @@ def _same_episodes(a: EpisodeRows, b: EpisodeRows) -> None:
         )
     if len(a) != len(b):
         raise RomnavError(
-            f"{both}: {len(a)} and {len(b)} episodes of set {a.provenance.episode_set}; "
-            "evaluate the shorter one again"
+            f"{both}: {len(a)} and {len(b)} episodes of set {a.provenance.episode_set}; evaluate the shorter one again"
         )
     for name in ("tile", "level"):
         if not np.array_equal(a.columns[name], b.columns[name]):

@@ -118,14 +118,10 @@ class Bootstrap:
         interval, mask = self._interval(draws_a - draws_b), self._masks[level]
         a_only = b_only = mid_p = None
         if len(self.arms[a].runs) == len(self.arms[b].runs) == 1:
-            solved_a, solved_b = (
-                self.arms[arm].runs[0].columns["success_time"][mask] <= horizon for arm in (a, b)
-            )
+            solved_a, solved_b = (self.arms[arm].runs[0].columns["success_time"][mask] <= horizon for arm in (a, b))
             a_only, b_only = int((solved_a & ~solved_b).sum()), int((solved_b & ~solved_a).sum())
             mid_p = mcnemar_mid_p(a_only, b_only)
-        return Contrast(
-            a, b, horizon, level, value_a - value_b, *interval, int(mask.sum()), a_only, b_only, mid_p
-        )
+        return Contrast(a, b, horizon, level, value_a - value_b, *interval, int(mask.sum()), a_only, b_only, mid_p)
 
     def _ratio(self, arm: str, metric: Metric, level: Level) -> tuple[float, NDArray]:
         """The metric's value, and its value in every resample, shape (resamples,)."""
@@ -135,9 +131,7 @@ class Bootstrap:
         value, draws = [], []
         for quantity in (names.index(metric.numerator), names.index(metric.denominator)):
             value.append(self._totals[runs, quantity, levels].sum())
-            draws.append(
-                (self._sums[runs, quantity, levels].sum(axis=1) * self._seed_weights[arm]).sum(axis=0)
-            )
+            draws.append((self._sums[runs, quantity, levels].sum(axis=1) * self._seed_weights[arm]).sum(axis=0))
         with np.errstate(invalid="ignore", divide="ignore"):
             return float(metric.scale * value[0] / value[1]), metric.scale * draws[0] / draws[1]
 

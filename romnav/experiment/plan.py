@@ -77,9 +77,7 @@ class Plan:
     @property
     def episode_set(self) -> Path:
         """The initial conditions that all arms share."""
-        return (
-            self.project.root / "experiments" / "episodes" / f"{self.scale.settings.evaluation.episodes}.json"
-        )
+        return self.project.root / "experiments" / "episodes" / f"{self.scale.settings.evaluation.episodes}.json"
 
     def settings(self, arm: str) -> Scale:
         """The scale's settings with the changes of a trained arm.
@@ -164,23 +162,17 @@ class Plan:
         known = {spec.name for spec in SPECS}
         for table in experiment.tables:
             if table not in known:
-                raise RomnavError(
-                    f"{self.project.file(name)}: tables: unknown table {table}{suggest(table, known)}"
-                )
+                raise RomnavError(f"{self.project.file(name)}: tables: unknown table {table}{suggest(table, known)}")
         arms = [(arm, seed) for arm in experiment.arms for seed in seeds]
         return Stage(
             kind="tables",
             name=f"tables {name}",
             folder=self.folder / "tables",
-            outputs=tuple(
-                f"{table}.{format}" for table in experiment.tables for format in ("tex", "md", "csv")
-            ),
+            outputs=tuple(f"{table}.{format}" for table in experiment.tables for format in ("tex", "md", "csv")),
             record=self.folder / "tables" / f"{name}.json",
             settings=experiment,
             uses=("tables",),
-            upstream=tuple(
-                self.episodes(arm, seed) for arm, seed in [*arms, *((arm, 0) for arm in SCRIPTED)]
-            ),
+            upstream=tuple(self.episodes(arm, seed) for arm, seed in [*arms, *((arm, 0) for arm in SCRIPTED)]),
         )
 
 

@@ -30,9 +30,7 @@ class Project:
         for root in (folder, *folder.parents):
             if (root / "experiments" / "scales").is_dir():
                 return cls(root, results or root / "results")
-        raise RomnavError(
-            f"{folder}: no experiments/ here or above; change to a copy of the romnav repository"
-        )
+        raise RomnavError(f"{folder}: no experiments/ here or above; change to a copy of the romnav repository")
 
     @cached_property
     def experiments(self) -> dict[str, Experiment]:

@@ -53,15 +53,11 @@ def require_trained(evaluations: Iterable[Stage]) -> None:
     Raises:
         RomnavError: One is not.
     """
-    for policy in (
-        stage for evaluation in evaluations for stage in evaluation.upstream if stage.kind == "policy"
-    ):
+    for policy in (stage for evaluation in evaluations for stage in evaluation.upstream if stage.kind == "policy"):
         if not store.finished(policy):
             changed = "; ".join(store.differences(policy))
             reason = f"was trained with other settings ({changed})" if changed else "is not trained"
-            raise RomnavError(
-                f"{policy.folder}: {policy.name} {reason}; run `romnav train policy {policy.arm}`"
-            )
+            raise RomnavError(f"{policy.folder}: {policy.name} {reason}; run `romnav train policy {policy.arm}`")
 
 
 def execute(

@@ -62,9 +62,7 @@ def load_experiments(folder: Path) -> dict[str, Experiment]:
     Raises:
         RomnavError: A file is invalid, or two experiments give one arm different settings.
     """
-    experiments = {
-        file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))
-    }
+    experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
     seen: dict[str, tuple[str, Arm]] = {}
     for name, experiment in experiments.items():
         for arm_name, arm in experiment.arms.items():

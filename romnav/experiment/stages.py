@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from romnav.world.spec import WorldSpec
     from romnav.world.world import World
 
+EVALUATION_NOISE = 1
+"""Seed of the sensor noise in evaluation: every arm meets the same noise in the same step of an episode."""
+
 
 def require_device(device: str) -> None:
     """Checks that a device is there.
@@ -85,7 +88,7 @@ class Stages:
 
         settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
-        perception = self._perception(stage.upstream[0], settings, world)
+        perception = self._perception(stage.upstream[0], settings, world, stage.seed or 0)
         path = train(
             settings.navigation,
             world,
@@ -113,7 +116,7 @@ class Stages:
             driver: Any = rollout.SCRIPTED[stage.arm]()
         else:
             encoder, trained = stage.upstream
-            perception = self._perception(encoder, settings, world)
+            perception = self._perception(encoder, settings, world, EVALUATION_NOISE)
             policy = trained.folder / "policy.pt"
             actor = checkpoint.load_actor(
                 policy, perception.encoder.token_shape, perception.encoder.digest(), self.device
@@ -121,9 +124,7 @@ class Stages:
             driver = rollout.Policy(actor, perception)
             record = store.read(trained)
             facts = record.facts if record else facts
-        measured = rollout.evaluate(
-            driver, world, paired, settings.navigation.env, settings.evaluation, progress
-        )
+        measured = rollout.evaluate(driver, world, paired, settings.navigation.env, settings.evaluation, progress)
         source = store.provenance()
         provenance = rows.Provenance(
             scale=self.plan.scale.name,
@@ -169,12 +170,12 @@ class Stages:
 
         return build(spec, self._worlds, progress)
 
-    def _perception(self, encoder: Stage, settings: Scale, world: World) -> LidarPerception:
+    def _perception(self, encoder: Stage, settings: Scale, world: World, seed: int) -> LidarPerception:
         from romnav.navigation.perception import LidarPerception
         from romnav.sensing import encoder as encoders
         from romnav.sensing.corruption import Corruption
 
-        corruption = Corruption(settings.pretrain.corruption, settings.pretrain.seed, self.device)
+        corruption = Corruption(settings.navigation.corruption, seed, self.device)
         frozen = encoders.load(encoder.folder / "encoder.pt", settings.pretrain.encoder, self.device)
         return LidarPerception(self._lidar(settings, world), corruption, frozen)
 

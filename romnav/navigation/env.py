@@ -70,18 +70,17 @@ class NavigationEnv(VecEnv):
         self._lookup = GeodesicLookup(world)
         self._privileged = PrivilegedObservation(world)
         count = spec.envs
-        long = {"dtype": torch.int64, "device": device}
-        self._env = torch.arange(count, **long)
-        self._episode = torch.zeros(count, **long)
+        self._env = torch.arange(count, device=device)
+        self._episode = torch.zeros_like(self._env)
         self._step = 0
-        self.episode_length_buf = torch.zeros(count, **long)
-        self._goal = torch.zeros(count, **long)
+        self.episode_length_buf = torch.zeros_like(self._env)
+        self._goal = torch.zeros_like(self._env)
         self._goal_position = torch.zeros(count, 3, device=device)
         self._goal_yaw = torch.zeros(count, device=device)
         self._command = torch.zeros(count, ACTIONS, device=device)
         self._best = torch.zeros(count, 2, device=device)
-        self._since_arrival = torch.full((count,), -1, **long)
-        self._since_best = torch.zeros(count, **long)
+        self._since_arrival = torch.full_like(self._env, -1)
+        self._since_best = torch.zeros_like(self._env)
         self._cross = torch.zeros(count, dtype=torch.bool, device=device)
         self._finished = torch.zeros(4, dtype=torch.float64, device=device)
         self._reward_sums = torch.zeros(8, dtype=torch.float64, device=device)
@@ -133,9 +132,7 @@ class NavigationEnv(VecEnv):
         d = self.dynamics
         state = torch.cat(
             [
-                goal_observation(
-                    d.position, d.yaw, self._goal_position, self._goal_yaw, self.spec.max_goal_distance
-                ),
+                goal_observation(d.position, d.yaw, self._goal_position, self._goal_yaw, self.spec.max_goal_distance),
                 self._command,
             ],
             dim=1,
@@ -234,9 +231,7 @@ class NavigationEnv(VecEnv):
         arrived = (self._since_arrival >= 0).double()
         ended = done.double()
         same, cross = ended * (~self._cross).double(), ended * self._cross.double()
-        self._finished += torch.stack(
-            [same.sum(), (same * arrived).sum(), cross.sum(), (cross * arrived).sum()]
-        )
+        self._finished += torch.stack([same.sum(), (same * arrived).sum(), cross.sum(), (cross * arrived).sum()])
 
     def _reset(self, envs: Tensor) -> None:
         episode = self._episode[envs]

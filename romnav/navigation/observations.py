@@ -39,7 +39,14 @@ def goal_observation(position: Tensor, yaw: Tensor, goal: Tensor, goal_yaw: Tens
     distance = torch.linalg.vector_norm(d, dim=1).clamp(min=0.1)
     gamma = goal_yaw - yaw
     return torch.stack(
-        [planar[:, 0], planar[:, 1], distance.log() / math.log(d_max), d[:, 2], torch.sin(gamma), torch.cos(gamma)],
+        [
+            planar[:, 0],
+            planar[:, 1],
+            distance.log() / math.log(d_max),
+            d[:, 2],
+            torch.sin(gamma),
+            torch.cos(gamma),
+        ],
         dim=1,
     )
 
@@ -68,11 +75,10 @@ class PrivilegedObservation:
         heading = rotate(direction, yaw)
         points = position[:, None, :2] + rotate(self.offsets.expand(len(yaw), -1, -1), -yaw)
         count = len(self.offsets)
-        node = self.world.node_at(
-            tile.repeat_interleave(count), layer.repeat_interleave(count), points.reshape(-1, 2)
-        )
+        node = self.world.node_at(tile.repeat_interleave(count), layer.repeat_interleave(count), points.reshape(-1, 2))
         occupied = (node < 0).view(len(yaw), count).to(torch.float32)
         scalars = torch.stack(
-            [geodesic / 30.0, torch.log(geodesic.clamp(min=0.05)), remaining, arrived, cross, heading[:, 0]], dim=1
+            [geodesic / 30.0, torch.log(geodesic.clamp(min=0.05)), remaining, arrived, cross, heading[:, 0]],
+            dim=1,
         )
         return torch.cat([scalars, heading[:, 1:2], occupied], dim=1)

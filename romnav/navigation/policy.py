@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -80,8 +81,12 @@ class RecurrentCore(nn.Module):
         super().__init__()
         self.width = width
         reference = nn.GRU(inputs, width, LAYERS)
-        self.input = nn.ModuleList(nn.Linear(inputs if k == 0 else width, 3 * width) for k in range(LAYERS))
-        self.recurrent = nn.ModuleList(nn.Linear(width, 3 * width) for _ in range(LAYERS))
+        self.input: Sequence[nn.Linear] = nn.ModuleList(  # type: ignore[assignment]
+            nn.Linear(inputs if k == 0 else width, 3 * width) for k in range(LAYERS)
+        )
+        self.recurrent: Sequence[nn.Linear] = nn.ModuleList(  # type: ignore[assignment]
+            nn.Linear(width, 3 * width) for _ in range(LAYERS)
+        )
         for k in range(LAYERS):
             self.input[k].weight.data.copy_(getattr(reference, f"weight_ih_l{k}"))
             self.input[k].bias.data.copy_(getattr(reference, f"bias_ih_l{k}"))
@@ -93,9 +98,7 @@ class RecurrentCore(nn.Module):
         keep = (~starts).to(x.dtype).unsqueeze(2)
         last = []
         for k in range(LAYERS):
-            x = GRULayer.apply(
-                self.input[k](x), hidden[k], keep, self.recurrent[k].weight, self.recurrent[k].bias
-            )
+            x = GRULayer.apply(self.input[k](x), hidden[k], keep, self.recurrent[k].weight, self.recurrent[k].bias)
             last.append(x[-1])
         return x, torch.stack(last)
 
@@ -137,7 +140,7 @@ class Attention(nn.Module):
 
 
 class NavigationActor(MLPModel):
-    """rsl-rl actor: attention over frozen LiDAR tokens, GRU, dense layer, Beta distributions over [-1, 1]^3.
+    """rsl-rl actor: attention over frozen LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
 
     In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts.
     """
@@ -145,7 +148,12 @@ class NavigationActor(MLPModel):
     is_recurrent = True
 
     def __init__(
-        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, spec: PolicySpec
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        spec: PolicySpec,
     ) -> None:
         tokens, channels = obs["lidar"].shape[1:]
         embedding = 64
@@ -202,9 +210,7 @@ class NavigationActor(MLPModel):
             self._hidden = like.new_zeros(LAYERS, batch, self.core.width)
         return self._hidden
 
-    def _get_obs_dim(
-        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str
-    ) -> tuple[list[str], int]:
+    def _get_obs_dim(self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str) -> tuple[list[str], int]:
         return ["state"], obs["state"].shape[-1]
 
     def _get_latent_dim(self) -> int:

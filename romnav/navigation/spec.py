@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from romnav.config import Config
+from romnav.sensing.spec import CorruptionSpec
 from romnav.world.spec import SamplerSpec
 
 
@@ -129,6 +130,9 @@ class NavigationSpec(Config):
 
     dynamics: Literal["rom"] = "rom"
     """The body that is driven."""
+    corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
+    """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
+    pretraining drops)."""
     env: EnvSpec = EnvSpec()
     policy: PolicySpec = PolicySpec()
     ppo: PPOSpec = PPOSpec()

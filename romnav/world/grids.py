@@ -117,9 +117,7 @@ def _footprint(
     u, v = c * dx + sn * dy, c * dy - sn * dx
     if solids.shape[s] == Shape.BOX:
         # half a micrometre of slack: a cell centre on the seam of two slabs belongs to one of them
-        distance = np.hypot(
-            np.maximum(np.abs(u) - half[0] - 5e-7, 0), np.maximum(np.abs(v) - half[1] - 5e-7, 0)
-        )
+        distance = np.hypot(np.maximum(np.abs(u) - half[0] - 5e-7, 0), np.maximum(np.abs(v) - half[1] - 5e-7, 0))
     else:
         distance = np.maximum(np.hypot(u, v) - half[0], 0)
     return window, u, v, distance

@@ -77,10 +77,8 @@ def _draw_goal(
     offset = (spawn - world.node_start[tile])[:, None]
     geodesic = world.fields[world.field_start[goals] + offset * exists].to(torch.float32) * UNIT
     target, source = world.position[world.goal[goals]], world.position[spawn]
-    if spec.cap == "geodesic":
-        capped = geodesic
-    else:
-        capped = torch.linalg.vector_norm(target - source[:, None], dim=2)
+    straight = torch.linalg.vector_norm(target - source[:, None], dim=2)
+    capped = geodesic if spec.cap == "geodesic" else straight
     valid = exists & (capped <= spec.max_distance) & (geodesic >= spec.min_distance)
     other = valid & is_cross_level(source[:, None, 2], target[..., 2])
     wanted = torch.where(world.storeys[tile] >= 3, 1.0, spec.cross_probability)

@@ -7,8 +7,9 @@ import json
 import os
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,11 +76,11 @@ class World:
 
     def to(self, device: str) -> World:
         """The same world with its tensors on ``device``."""
-        moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self.__dict__.items()}
-        return World(**moved)
+        moved: dict[str, Any] = {k: v.to(device) for k, v in self.__dict__.items() if isinstance(v, Tensor)}
+        return replace(self, **moved)
 
     def index(self, xy: Tensor) -> Tensor:
-        """(E, 2) int64 cell of positions (E, 2), clamped to the tile. The only place where a position becomes a cell."""
+        """(E, 2) int64 cells of positions (E, 2), clamped to the tile: the only place that turns one into the other."""
         return (xy / self.cell).floor().long().clamp_(0, self.node.shape[-1] - 1)
 
     def node_at(self, tile: Tensor, layer: Tensor, xy: Tensor) -> Tensor:
@@ -94,9 +95,7 @@ class World:
         return self.height[tile, layer, cell[:, 0], cell[:, 1]]
 
 
-def build(
-    spec: WorldSpec, cache: Path | None = None, progress: Callable[[int, int, str], None] | None = None
-) -> World:
+def build(spec: WorldSpec, cache: Path | None = None, progress: Callable[[int, int, str], None] | None = None) -> World:
     """Generate the tiles of ``spec``, choose their goals and compute every goal's geodesic field.
 
     Goals are drawn uniformly over the free cells off stairs and ramps, half of the draws per floor rather than per
@@ -107,8 +106,9 @@ def build(
     if path and path.exists():
         try:
             with path.open("rb") as file:
-                stored = pickle.load(file)
-            return World(**{k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in stored.items()})
+                stored: dict[str, Any] = pickle.load(file)
+            tensors = {k: torch.from_numpy(v) for k, v in stored.items() if isinstance(v, np.ndarray)}
+            return World(**(stored | tensors))
         except (pickle.UnpicklingError, EOFError):
             path.unlink()
     tiles, grids, goals = [], [], []

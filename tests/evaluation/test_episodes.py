@@ -72,7 +72,7 @@ def test_torn_and_missing_sets(drawn: EpisodeSet, tmp_path: Path) -> None:
 def test_goal_in_a_wall_is_found(drawn: EpisodeSet, world: World, tmp_path: Path) -> None:
     """A set that does not fit its terrain, as after a change of the generator, is refused whole."""
     wrong = EpisodeSet("test", drawn.world, {**drawn.columns, "spawn_x": np.full(48, 0.05)})
-    with pytest.raises(RomnavError, match="episode 0 does not fit its terrain .* drawn by another world generator"):
+    with pytest.raises(RomnavError, match=r"episode 0 does not fit its terrain .* drawn by another world generator"):
         episodes.terrain(wrong, tmp_path / "test.json", None)
 
 

@@ -55,9 +55,7 @@ def test_success_counts_up_to_the_horizon_itself() -> None:
 
 
 def test_a_goal_at_the_spawn_divides_by_nothing() -> None:
-    m = metrics.evaluate(
-        columns(geodesic=[0.0] * 4, path_length=[0.0, 0.0, 0.0, 4.0], final_distance=[0.0, 0.1, 9, 9])
-    )
+    m = metrics.evaluate(columns(geodesic=[0.0] * 4, path_length=[0.0, 0.0, 0.0, 4.0], final_distance=[0.0, 0.1, 9, 9]))
     assert m["spl"] == 0.5
     assert m["soft_spl"] == pytest.approx((1 + 0.8) / 4)
 

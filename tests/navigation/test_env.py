@@ -29,13 +29,11 @@ def test_same_seed_same_run(world: World, perception: object, spec: NavigationSp
     for step in range(30):
         a, b = one.step(actions(12, step)), two.step(actions(12, step))
         assert torch.equal(a[1], b[1])
-        for key in a[0].keys():
-            assert torch.equal(a[0][key], b[0][key])
+        for key, value in a[0].items():
+            assert torch.equal(value, b[0][key])
 
 
-def test_environments_are_independent_of_their_number(
-    world: World, perception: object, spec: NavigationSpec
-) -> None:
+def test_environments_are_independent_of_their_number(world: World, perception: object, spec: NavigationSpec) -> None:
     """Environment 3 of 12 lives the same life as environment 3 of 5, resets included."""
     few = spec.env.model_copy(update={"envs": 5})
     large, small = make(world, perception, spec.env), make(world, perception, few)
@@ -64,9 +62,7 @@ def test_restored_environment_goes_on_as_if_never_stopped(
     assert repr(env.statistics()) == repr(other.statistics())
 
 
-def test_timeouts_are_truncations_at_the_episode_length(
-    world: World, perception: object, spec: NavigationSpec
-) -> None:
+def test_timeouts_are_truncations_at_the_episode_length(world: World, perception: object, spec: NavigationSpec) -> None:
     env = make(world, perception, spec.env.model_copy(update={"stay": 100.0}))
     env.episode_length_buf[:] = 0
     for step in range(1, 21):

@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from romnav.navigation.observations import PATCH, PRIVILEGED_SIZE, PrivilegedObservation, goal_observation, rotate
+from romnav.navigation.observations import (
+    PATCH,
+    PRIVILEGED_SIZE,
+    PrivilegedObservation,
+    goal_observation,
+    rotate,
+)
 from romnav.world.world import World
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -43,7 +45,7 @@ def test_recurrent_core_equals_torch_gru_between_resets() -> None:
     out, last = core(x, hidden, starts)
     for env, cuts in ((0, [0, 9]), (2, [0, 5, 9]), (3, [0, 9])):
         h = hidden[:, env : env + 1].clone()
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        for a, b in pairwise(cuts):
             if starts[a, env]:
                 h = torch.zeros_like(h)
             expected, h = gru(x[a:b, env : env + 1], h.contiguous())

@@ -80,9 +80,7 @@ def test_killed_and_resumed_equals_left_alone(
     assert len(curves[0]) == spec.ppo.iterations
 
 
-def test_learning_rate_stays_in_bounds(
-    world: World, perception: object, spec: NavigationSpec, tmp_path: Path
-) -> None:
+def test_learning_rate_stays_in_bounds(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
     low, high = spec.ppo.learning_rate_range
     tight = spec.model_copy(update={"ppo": spec.ppo.model_copy(update={"desired_kl": 1e-9, "iterations": 6})})
     train.train(tight, world, perception, tmp_path, 1)

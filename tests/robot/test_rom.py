@@ -99,7 +99,10 @@ def test_changes_layer_by_height_on_every_stair(world: World) -> None:
     """Driven along each connector's centre line, the robot ends on the connector's other layer."""
     for t, tile in enumerate(world.tiles):
         for connector in tile.connectors:
-            for path, layers in ((connector.path, connector.layers), (connector.path[::-1], connector.layers[::-1])):
+            for path, layers in (
+                (connector.path, connector.layers),
+                (connector.path[::-1], connector.layers[::-1]),
+            ):
                 first = torch.tensor(path[0].copy(), dtype=torch.float32)
                 robot = ReducedOrderModel(world, 1, 0.2)
                 one = torch.zeros(1, dtype=torch.int64)

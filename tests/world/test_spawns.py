@@ -52,7 +52,9 @@ def test_the_four_samplers(world: World, probability: float, cap: str) -> None:
         offset = world.position[goal] - world.position[spawn]
         assert torch.linalg.vector_norm(offset, dim=1).max() <= spec.max_distance
     on_stair = torch.isin(spawn, world.spawn)
-    share = torch.tensor([(world.spawn_start[t + 1] - world.spawn_start[t]) for t in range(8)]) / world.node_start.diff()
+    share = (
+        torch.tensor([(world.spawn_start[t + 1] - world.spawn_start[t]) for t in range(8)]) / world.node_start.diff()
+    )
     has = world.spawn_start.diff() > 0
     expected = torch.where(has, probability + (1 - probability) * share, 0.0).mean().item()
     assert on_stair.float().mean().item() == pytest.approx(expected, abs=0.025)
