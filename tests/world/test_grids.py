@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from romnav.world.grids import OFFSETS_8, Grids, rasterise
-from romnav.world.solids import Label, Shape, Solids, SolidsBuilder
-from romnav.world.spec import GridSpec, WorldSpec
+from romnav.world.solids import Label, Solids, SolidsBuilder
+from romnav.world.spec import GridSpec
 from romnav.world.tile import Tile, TileClass
 
 SPEC = GridSpec()
@@ -166,13 +166,15 @@ def test_an_inclined_beam_occupies_where_its_underside_is_low_anywhere_over_the_
     np.testing.assert_array_equal(grids.free[0, over, 25], (lowest >= 1.4)[over])
 
 
-def test_a_curb_is_free_and_a_step_of_a_metre_is_not() -> None:
-    spec = WorldSpec().grid
+@pytest.mark.parametrize("radius", [0.3, 0.5])
+def test_a_curb_is_free_and_a_step_of_a_metre_keeps_the_robots_radius(radius: float) -> None:
     for rise, crossed in ((0.15, True), (1.0, False)):
         builder = SolidsBuilder()
-        builder.box((7.5, 5.0), (5.0, 10.0), (-0.1, rise), label=Label.GROUND, layers=(0, 0))
-        grids = _flat(builder)
-        assert grids.free[0, 24, 25] == crossed
-        assert np.isclose(grids.height[0, 30, 25], rise)
-        assert spec.max_step > 0.15
-    assert Shape.BOX == 0
+        builder.box((5.0, 5.0), (10.0, 10.0), (-0.2, 0.0), label=Label.GROUND, layers=(0, 0))
+        builder.box((5.0, 8.0), (10.0, 4.0), (-0.1, rise), label=Label.GROUND, layers=(0, 0))
+        tile = Tile(TileClass.ROOM, 0, 10.0, builder.build(), (0.0,), (0,), ())
+        column = rasterise(tile, GridSpec(robot_radius=radius)).free[0, 25]
+        y = (np.arange(50) + 0.5) * 0.2
+        clear = (y >= radius - 1e-9) & (y <= 10.0 - radius + 1e-9)
+        apart = clear & (np.abs(y - 6.0) >= radius - 1e-9) & (y < 6.0)  # the larger side
+        np.testing.assert_array_equal(column, clear if crossed else apart)
