@@ -10,7 +10,9 @@ from romnav.sensing.spec import CorruptionSpec
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(
+    {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": "-march=native -w"}
+)
 
 _GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
 _STRIDE = wp.constant(wp.uint32(0x9E3779B1))
@@ -128,5 +130,6 @@ class Corruption:
             ],
             outputs=[wp.from_torch(out.flatten(1))],
             device=self._device,
+            stream=None if self._device == "cpu" else wp.stream_from_torch(torch.device(self._device)),
         )
         return out

@@ -20,6 +20,8 @@ from romnav.sensing.spec import EncoderSpec
 from romnav.world.solids import Label
 
 FORMAT = "romnav-encoder-1"
+LOGIT = 10.0
+"""Size of a logit that is 1 before scaling: lets the masks learn at the pace of the lengths."""
 AGAIN = "run `romnav train encoder` again"
 
 
@@ -114,33 +116,29 @@ class Reconstruction(NamedTuple):
 class Decoder(nn.Module):
     """Deconvolutions from the latent map to the heads, mirroring the encoder's stages.
 
-    The pixels' directions join the last features, so that a head need not memorise the sensor's geometry.
+    Each pixel has a learned offset, the image that is seen on average.
     """
-
-    directions: Tensor
 
     def __init__(self, encoder: Encoder) -> None:
         super().__init__()
         spec = encoder.spec
-        self._image_shape = encoder.image_shape
         self._outputs = (1, 3 * spec.cartesian, 1, len(Label))
-        self.register_buffer("directions", encoder.directions.permute(2, 0, 1), persistent=False)
         before = spec.widths[-1]
         layers: list[nn.Module] = [nn.Conv2d(spec.latent, before, 3, 1, 1), nn.ReLU()]
-        for width, stride in zip((*spec.widths[-2::-1], spec.widths[0]), spec.strides[::-1], strict=True):
+        for width, stride in zip(spec.widths[-2::-1], spec.strides[:0:-1], strict=True):
             layers += [nn.ConvTranspose2d(before, width, stride, stride), nn.ReLU()]
             layers += [nn.Conv2d(width, width, 3, 1, 1), nn.ReLU()]
             before = width
-        self.trunk = nn.Sequential(*layers[:-2])
-        self.heads = nn.Conv2d(before + 3, sum(self._outputs), 1)
+        self.trunk = nn.Sequential(*layers)
+        self.heads = nn.ConvTranspose2d(before, sum(self._outputs), spec.strides[0], spec.strides[0])
+        self.offset = nn.Parameter(torch.zeros(sum(self._outputs), *encoder.image_shape))
 
     def forward(self, latent: Tensor) -> Reconstruction:
         """Reconstruction from a latent map (B, latent, map rows, map columns)."""
-        rows, columns = self._image_shape
-        features = self.trunk(latent)[:, :, :rows, :columns]
-        geometry = self.directions.expand(len(latent), -1, -1, -1)
-        ranges, xyz, valid, classes = self.heads(torch.cat([features, geometry], 1)).split(self._outputs, 1)
-        return Reconstruction(ranges.squeeze(1), xyz, valid.squeeze(1), classes)
+        _, rows, columns = self.offset.shape
+        outputs = self.heads(self.trunk(latent))[:, :, :rows, :columns].float() + self.offset
+        ranges, xyz, valid, classes = outputs.split(self._outputs, 1)
+        return Reconstruction(ranges.squeeze(1), xyz, LOGIT * valid.squeeze(1), LOGIT * classes)
 
 
 class Autoencoder(nn.Module):
@@ -154,6 +152,7 @@ class Autoencoder(nn.Module):
             for layer in trunk:
                 if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def save(path: Path, model: Autoencoder, extra: dict[str, Any] | None = None) -> None:

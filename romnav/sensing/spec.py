@@ -34,6 +34,25 @@ class LidarSpec(Config):
     """"columns" intersects the solids in closed form; "mesh" casts rays at their triangles, as an oracle."""
 
 
+class DepthSpec(Config):
+    """Depth image of a ZED Mini in the head of a G1, looking down (paper, Sec. III-A)."""
+
+    rows: int = Field(default=26, ge=1)
+    """Pixels downwards (P)."""
+    columns: int = Field(default=30, ge=1)
+    """Pixels across (P)."""
+    field: tuple[float, float] = (85.0, 54.0)
+    """Horizontal and vertical field of view, degrees (A: ZED Mini data sheet at 720p)."""
+    pitch: float = 60.0
+    """Optical axis below the horizon, degrees (A: from the feet to 2 m ahead)."""
+    height: float = 1.265
+    """Camera above the terrain under a standing robot, m (A: beside the LiDAR)."""
+    min_range: float = Field(default=0.1, ge=0.0)
+    """Least depth along the optical axis, m (A: ZED Mini data sheet)."""
+    max_range: float = Field(default=6.0, gt=0.0)
+    """Largest depth along the optical axis, m (A: stereo error reaches decimetres there)."""
+
+
 class CorruptionSpec(Config):
     """What is done to clean range images (paper, "Pretraining Vision Encoders")."""
 
@@ -80,9 +99,9 @@ class PretrainSpec(Config):
     """Images, half from uniform poses and half on or near stairs and ramps (P)."""
     epochs: int = Field(default=10, ge=1)
     """Passes over the images, each with new corruption (P)."""
-    batch: int = Field(default=128, ge=1)
+    batch: int = Field(default=64, ge=1)
     """Images per gradient step (A)."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 4e-3
     """Peak of AdamW's learning rate, then a cosine to zero (A)."""
     weight_decay: float = 1e-4
     """Of AdamW (A)."""
@@ -94,3 +113,15 @@ class PretrainSpec(Config):
     """Divergence that each latent dimension has for free, nat (A)."""
     seed: int = 0
     """Seed of weights, poses and corruption."""
+
+
+DEPTH_PRETRAIN = PretrainSpec(
+    encoder=EncoderSpec(cartesian=False, scale=2.0, widths=(16, 32, 64, 64), strides=((2, 2),) * 4),
+    corruption=CorruptionSpec(noise=(0.002, 0.0, 0.004), occlusion=((0.15, 0.85, 0.88, 1.0),)),
+    sigma=0.2,
+)
+"""Training of the depth camera's encoder.
+
+Stereo noise grows with the square of depth: 0.2 pixels of disparity at 63 mm baseline and 700 pixels focal length (A);
+the chest hides the lower edge of the image (A).
+"""

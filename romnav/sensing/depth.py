@@ -1,0 +1,189 @@
+"""Depth images of the camera that looks down from the robot's head (paper, Sec. III-A)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from romnav.sensing import columns
+from romnav.sensing.spec import DepthSpec
+from romnav.world.solids import Solids
+
+wp.config.log_level = wp.LOG_WARNING
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def _clip(span: wp.vec2, normal: float, offset: float):  # type: ignore[no-untyped-def]
+    """Part of ``span`` where ``normal t <= offset``; empty if its end is the smaller."""
+    if normal < 0.0:
+        span[0] = wp.max(span[0], offset / normal)
+    elif normal > 0.0:
+        span[1] = wp.min(span[1], offset / normal)
+    elif offset < 0.0:
+        span[1] = -1.0
+    return span
+
+
+@wp.func
+def _slab(span: wp.vec2, half: float, o: float, d: float):  # type: ignore[no-untyped-def]
+    return _clip(_clip(span, d, half - o), -d, half + o)
+
+
+@wp.func
+def _disc(span: wp.vec2, radius: float, ou: float, ov: float, du: float, dv: float):  # type: ignore[no-untyped-def]
+    a = du * du + dv * dv
+    across = ou * dv - ov * du
+    under = a * radius * radius - across * across
+    if under <= 0.0:
+        return wp.where(a == 0.0 and ou * ou + ov * ov <= radius * radius, span, wp.vec2(1.0, 0.0))
+    middle = -(ou * du + ov * dv) / a
+    reach = wp.sqrt(under) / a
+    return wp.vec2(wp.max(span[0], middle - reach), wp.min(span[1], middle + reach))
+
+
+@wp.kernel
+def _cast(
+    solids: wp.array(dtype=columns.Solid),
+    first: wp.array(dtype=wp.int32),
+    rays: wp.array2d(dtype=wp.vec3),
+    limits: wp.vec2,
+    reach: float,
+    tile: wp.array(dtype=wp.int32),
+    origin: wp.array(dtype=wp.vec3),
+    torso: wp.array(dtype=wp.mat33),
+    depth: wp.array3d(dtype=float),
+    labels: wp.array3d(dtype=wp.int8),
+):
+    env, row = wp.tid()
+    o = origin[env]
+    for column in range(rays.shape[1]):
+        depth[env, row, column] = limits[1]
+    for i in range(first[tile[env]], first[tile[env] + 1]):
+        solid = solids[i]
+        px = o[0] - solid.x
+        py = o[1] - solid.y
+        distance = solid.radius + reach
+        if px * px + py * py > distance * distance or solid.lowest > o[2] + reach or solid.highest < o[2] - reach:
+            continue
+        ou = solid.cos * px + solid.sin * py
+        ov = solid.cos * py - solid.sin * px
+        top = solid.top + solid.slope_top * ou - o[2]
+        bottom = solid.bottom + solid.slope_bottom * ou - o[2]
+        for column in range(rays.shape[1]):
+            d = torso[env] * rays[row, column]
+            du = solid.cos * d[0] + solid.sin * d[1]
+            dv = solid.cos * d[1] - solid.sin * d[0]
+            span = wp.vec2(0.0, depth[env, row, column])
+            span = _clip(span, d[2] - solid.slope_top * du, top)
+            span = _clip(span, solid.slope_bottom * du - d[2], -bottom)
+            if solid.cylinder != 0:
+                span = _disc(span, solid.half_u, ou, ov, du, dv)
+            else:
+                span = _slab(_slab(span, solid.half_u, ou, du), solid.half_v, ov, dv)
+            if span[0] <= span[1] and span[0] < depth[env, row, column]:
+                depth[env, row, column] = span[0]
+                if labels:
+                    labels[env, row, column] = wp.int8(solid.label)
+    for column in range(rays.shape[1]):
+        z = depth[env, row, column]
+        if z < limits[0] or z >= limits[1]:
+            depth[env, row, column] = 0.0
+            if labels:
+                labels[env, row, column] = wp.int8(-1)
+
+
+class DepthCamera:
+    """The depth camera of every environment over a fixed set of tiles.
+
+    A pinhole camera, fixed to the torso; each pixel is one ray through its centre and holds the depth along
+    the optical axis. A ray that starts inside a solid has no return.
+
+    Args:
+        solids: The solids of each tile.
+        spec: Image and mounting.
+        device: Where to compute, "cpu" or "cuda".
+    """
+
+    directions: Tensor
+    """(rows, columns, 3), torso frame (x forward, y left, z up): a pixel's point is ``depth * direction``."""
+
+    def __init__(self, solids: Sequence[Solids], spec: DepthSpec, device: str = "cpu") -> None:
+        wp.init()
+        self.spec = spec
+        self.device = device
+        across, down = (math.tan(math.radians(f) / 2) for f in spec.field)
+        left = across * (1 - (2 * np.arange(spec.columns) + 1) / spec.columns)
+        up = down * (1 - (2 * np.arange(spec.rows) + 1) / spec.rows)[:, None]
+        c, s = math.cos(math.radians(spec.pitch)), math.sin(math.radians(spec.pitch))
+        rays = np.stack(np.broadcast_arrays(c + s * up, left, c * up - s), axis=-1)
+        self.directions = torch.tensor(rays, dtype=torch.float32, device=device)
+        self._rays = wp.from_torch(self.directions, dtype=wp.vec3)
+        self._reach = spec.max_range * float(np.linalg.norm(rays, axis=-1).max())
+        packed = np.concatenate([columns.pack(s) for s in solids])
+        self._solids = wp.array(packed, dtype=columns.Solid, device=device)
+        self._first = wp.array(np.cumsum([0, *map(len, solids)]), dtype=wp.int32, device=device)
+
+    def scan(
+        self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: bool = False, tilt: Tensor | None = None
+    ) -> Tensor | tuple[Tensor, Tensor]:
+        """Measure the depth images, without noise.
+
+        Args:
+            tile: (E,) int32, tile of each environment.
+            origin: (E, 3) float32, camera centre in the tile frame, m.
+            yaw: (E,) float32, heading of the torso, rad.
+            labels: Whether to return the `romnav.world.solids.Label` of each return as well.
+            tilt: (E, 2) float32, roll and pitch of the torso, rad; None if upright.
+
+        Returns:
+            (E, rows, columns) float32 depths in m, 0 where there is no return; with ``labels`` also
+            (E, rows, columns) int8, -1 where there is no return.
+        """
+        shape = (len(tile), self.spec.rows, self.spec.columns)
+        depth = torch.empty(shape, device=self.device)
+        classes = torch.empty(shape, dtype=torch.int8, device=self.device) if labels else None
+        pose = (tile.int().contiguous(), origin.float().contiguous(), _rotation(yaw.float(), tilt))
+        types = (wp.int32, wp.vec3, wp.mat33)
+        stream = None if self.device == "cpu" else wp.stream_from_torch(torch.device(self.device))
+
+        def launch(part: slice) -> None:
+            inputs = [
+                self._solids,
+                self._first,
+                self._rays,
+                wp.vec2(self.spec.min_range, self.spec.max_range),
+            ]
+            inputs += [
+                self._reach,
+                *(wp.from_torch(x[part], dtype=t) for x, t in zip(pose, types, strict=True)),
+            ]
+            out = [wp.from_torch(depth[part]), None if classes is None else wp.from_torch(classes[part])]
+            size = (part.stop - part.start, self.spec.rows)
+            wp.launch(_cast, size, [*inputs, *out], device=self.device, stream=stream)
+
+        # a launch on the CPU runs on one thread, but releases the interpreter's lock
+        threads = torch.get_num_threads() if self.device == "cpu" else 1
+        bounds = np.linspace(0, len(tile), threads + 1).astype(int).tolist()
+        wp.load_module(device=self.device)
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(launch, map(slice, bounds[:-1], bounds[1:])))
+        return depth if classes is None else (depth, classes)
+
+
+def _rotation(yaw: Tensor, tilt: Tensor | None) -> Tensor:
+    """(E, 3, 3) from the torso to the tile frame, by yaw, then pitch, then roll."""
+    roll, pitch = (torch.zeros(len(yaw), 2, device=yaw.device) if tilt is None else tilt.float()).unbind(1)
+    (cy, cp, cr), (sy, sp, sr) = ([f(a) for a in (yaw, pitch, roll)] for f in (torch.cos, torch.sin))
+    rows = [
+        torch.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], 1),
+        torch.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], 1),
+        torch.stack([-sp, cp * sr, cp * cr], 1),
+    ]
+    return torch.stack(rows, 1).contiguous()
