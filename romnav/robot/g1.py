@@ -25,7 +25,7 @@ SOLE = (0.035, 0.0, -0.035)
 """Centre of the sole in the frame of the ankle-roll body, m."""
 FOOT_LENGTH, FOOT_WIDTH = 0.185, 0.07
 """Size of the sole, m."""
-_TOE, _HEEL, _SOLE_RADIUS = 0.1175, -0.0475, 0.01
+_SOLE_RADIUS = 0.01
 
 
 class Boxes(NamedTuple):
@@ -53,22 +53,24 @@ def _weld(spec: mujoco.MjSpec, joint: str, angle: float) -> None:
 
 
 def _collide_with_ground(spec: mujoco.MjSpec, friction: float) -> None:
-    """Every collision geom meets the ground; of the robot itself only the legs below the knee meet each other.
+    """Every collision geom meets the ground; of the robot itself only the shanks meet each other.
 
-    Each sole is a pair of capsules along its edges, which a stair's edge supports anywhere on its length
-    (spheres at the corners let an edge through), and which MuJoCo meets with boxes in closed form.
+    Each sole is six spheres, three along each edge, so that a stair's edge is felt between heel and toe. Spheres,
+    because MuJoCo pushes them out of a box even when their centre is inside (a 10 ms step at touch-down does
+    that); capsules are then held in place instead, and the foot sinks in.
     """
     for side in SIDES:
         foot = spec.body(f"{side}_ankle_roll_link")
         for geom in [g for g in foot.geoms if "collision" in g.name]:
             spec.delete(geom)
-        for k, y in enumerate((FOOT_WIDTH / 2 - _SOLE_RADIUS, -FOOT_WIDTH / 2 + _SOLE_RADIUS)):
-            z = SOLE[2] + _SOLE_RADIUS
+        for k in range(6):
+            x = SOLE[0] + (k // 2 - 1) * (FOOT_LENGTH / 2 - _SOLE_RADIUS)
+            y = (1 - 2 * (k % 2)) * (FOOT_WIDTH / 2 - _SOLE_RADIUS)
             foot.add_geom(
                 name=f"{side}_sole{k}_collision",
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=[_SOLE_RADIUS, 0, 0],
-                fromto=[_HEEL, y, z, _TOE, y, z],
+                pos=[x, y, SOLE[2] + _SOLE_RADIUS],
                 condim=3,
                 priority=1,
                 friction=[friction, 0.005, 0.0001],
@@ -79,10 +81,10 @@ def _collide_with_ground(spec: mujoco.MjSpec, friction: float) -> None:
             geom.contype, geom.conaffinity, geom.condim = 0, 1, 3
     for pair in list(spec.pairs):
         spec.delete(pair)
-    for a in ("shin_collision", "linkage_brace_collision", "sole0_collision", "sole1_collision"):
-        for b in ("shin_collision", "linkage_brace_collision", "sole0_collision", "sole1_collision"):
-            if ("sole" in a) == ("sole" in b):
-                spec.add_pair(geomname1=f"left_{a}", geomname2=f"right_{b}", condim=1)
+    shank = ("shin_collision", "linkage_brace_collision")
+    for a in shank:
+        for b in shank:
+            spec.add_pair(geomname1=f"left_{a}", geomname2=f"right_{b}", condim=1)
 
 
 def build_spec(spec: RobotSpec, ground: Boxes, *, visual: bool = False) -> mujoco.MjSpec:
@@ -124,9 +126,7 @@ def build_spec(spec: RobotSpec, ground: Boxes, *, visual: bool = False) -> mujoc
     world = model.worldbody
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
     for centre, half, quat in zip(*ground, strict=True):
-        world.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half, quat=quat, contype=1, conaffinity=1
-        )
+        world.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half, quat=quat, contype=1, conaffinity=1)
     for body in model.bodies:
         if any(geom.contype or geom.conaffinity for geom in body.geoms) and body.name != "world":
             model.add_sensor(
@@ -234,7 +234,7 @@ class Humanoids:
 
     def randomize(self, friction: Tensor, payload: Tensor) -> None:
         """Give every robot its own foot friction (n,) and torso payload (n,), kg."""
-        soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in (0, 1)]
+        soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in range(6)]
         self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
         torso = self.model.body("torso_link").id
         self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
@@ -252,5 +252,8 @@ class Humanoids:
         for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             getattr(self.batch, name)[:] = state[name]
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self.touch, self.torque = torch.from_numpy(state["touch"].copy()), torch.from_numpy(state["torque"].copy())
+        self.touch, self.torque = (
+            torch.from_numpy(state["touch"].copy()),
+            torch.from_numpy(state["torque"].copy()),
+        )
         self._read()

@@ -20,7 +20,7 @@ class RobotSpec(Config):
     """Knee and waist position gain, N m/rad (A: the knee carries the weight on stairs)."""
     kp_ankle: float = 40.0
     """Ankle position gain, N m/rad (A)."""
-    kd_ratio: float = 0.08
+    kd_ratio: float = 0.07
     """Velocity gain over position gain, s (A)."""
     weld_arms: bool = True
     """Fix the 14 arm joints at `elbow` (A: 15 instead of 29 joints halve the cost; navigation never uses the arms)."""
@@ -39,21 +39,29 @@ class GaitSpec(Config):
     """Height of the pelvis above the mean of both feet's ground, m: bent knees."""
     sink: float = 0.25
     """How much the pelvis sinks for each metre of height between the feet, -: keeps both in reach on stairs."""
-    width: float = 0.22
+    width: float = 0.20
     """Distance between the feet, m."""
     clearance: float = 0.09
     """Apex of the swing foot above the highest ground under its path, m."""
     swing_end: float = 1.0
     """Part of the step after which the swing foot is to stand."""
+    swing_across: float = 0.95
+    """Part of the swing after which the foot is over its foothold, -: the leg trails its target by about 60 ms."""
+    height_gain: float = 0.5
+    """Extra stance extension per metre of sag of the pelvis, -."""
     reach_forward: tuple[float, float] = (-0.40, 0.58)
     """Limits of a foothold ahead of the stance foot, m."""
     reach_side: tuple[float, float] = (0.14, 0.42)
     """Limits of a foothold beside the stance foot, m."""
-    edge_search: float = 0.14
+    edge_search: float = 0.10
     """How far a foothold may be moved along the heading to keep the sole off a stair's edge, m."""
+    acceleration: tuple[float, float, float] = (0.8, 0.8, 1.5)
+    """Fastest change of the command that the reference follows, m/s^2, m/s^2, rad/s^2."""
+    speed_gain: float = 1.0
+    """Commanded over orbit velocity in foot placement, -: makes up for what the real leg loses at touch-down."""
     pull: float = 0.6
     """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's share of balance."""
-    upright_gain: float = 1.0
+    upright_gain: float = 2.5
     """Extra stance correction per radian of pelvis tilt, -."""
 
 

@@ -33,7 +33,9 @@ def evolve(position: Tensor, velocity: Tensor, time: Tensor, w: float) -> tuple[
     return c * position + s / w * velocity, w * s * position + c * velocity
 
 
-def orbit(command: Tensor, side: Tensor, time: Tensor, duration: float, width: float, w: float) -> tuple[Tensor, Tensor]:
+def orbit(
+    command: Tensor, side: Tensor, time: Tensor, duration: float, width: float, w: float
+) -> tuple[Tensor, Tensor]:
     """Periodic gait of a commanded velocity: the centre of mass from the stance foot, and its velocity.
 
     Args:
@@ -127,19 +129,27 @@ class Walker:
         self.clock = torch.zeros(count, dtype=torch.long)
         self.lift = torch.zeros(count, 3)
         self.foothold = torch.zeros(count, 3)
+        self.planted = torch.zeros(count, 3)
+        self.landed = torch.ones(count, dtype=torch.bool)
         self.base = torch.zeros(count)
         self.heading = torch.zeros(count)
+        self.command = torch.zeros(count, 3)
         self.joints = self.stance().expand(count, 2, 6).clone()
 
     def stance(self) -> Tensor:
         """Leg joints (1, 2, 6) of standing at the nominal height with the feet apart."""
         y = self.spec.width / 2
-        ankle = torch.tensor([[[-SOLE[0], y, -self.spec.pelvis - SOLE[2]], [-SOLE[0], -y, -self.spec.pelvis - SOLE[2]]]])
+        ankle = torch.tensor(
+            [[[-SOLE[0], y, -self.spec.pelvis - SOLE[2]], [-SOLE[0], -y, -self.spec.pelvis - SOLE[2]]]]
+        )
         start = torch.tensor([-0.3, 0.0, 0.0, 0.6, -0.3, 0.0]).expand(1, 2, 6)
         return self.legs.inverse(ankle, torch.eye(3).expand(1, 2, 3, 3), start, iterations=20)
 
-    def reset(self, ids: Tensor, clock: Tensor, heading: Tensor) -> None:
-        """Start robots `ids` at `clock` (k,), a multiple of the step's ticks, with their feet side by side."""
+    def reset(self, ids: Tensor, clock: Tensor, heading: Tensor, velocity: Tensor) -> None:
+        """Start robots `ids` at `clock` (k,), a multiple of the step's ticks, with their feet side by side and
+        `velocity` (k, 2), m/s, in the heading frame."""
+        self.command[ids, :2] = velocity
+        self.command[ids, 2] = 0.0
         self.clock[ids] = clock
         self.heading[ids] = heading
         self.joints[ids] = self.stance().expand(len(ids), 2, 6)
@@ -164,7 +174,9 @@ class Walker:
         best = (tries.abs() + 8.0 * (bump - 0.015).clamp(min=0.0)).argmin(1)
         return self._along(point, heading, tries[best][:, None])[:, 0]
 
-    def update(self, robots: Humanoids, command: Tensor, ground: HeightMap, *, first: Tensor | None = None) -> Reference:
+    def update(
+        self, robots: Humanoids, command: Tensor, ground: HeightMap, *, first: Tensor | None = None
+    ) -> Reference:
         """The reference of this control step.
 
         Args:
@@ -175,18 +187,29 @@ class Walker:
         """
         s = self.spec
         rows = torch.arange(len(command))
+        slew = torch.tensor(s.acceleration) * self.dt
+        self.command = self.command + torch.maximum(torch.minimum(command - self.command, slew), -slew)
+        speed, turn = self.command[:, :2] * s.speed_gain, self.command[:, 2]
         tick = self.clock % s.step_ticks
         stance_left = (self.clock // s.step_ticks) % 2 == 0
         side = torch.where(stance_left, 1.0, -1.0)
         stance, swing = (~stance_left).long(), stance_left.long()
         phase = tick / s.step_ticks
-        start = tick == 0 if first is None else (tick == 0) | first
+        fresh = torch.zeros_like(tick, dtype=torch.bool) if first is None else first
+        start = (tick == 0) | fresh
 
         yaw = torch.atan2(robots.orientation[:, 1, 0], robots.orientation[:, 0, 0])
-        lead = wrap(self.heading + command[:, 2] * self.dt - yaw).clamp(-0.35, 0.35)
+        lead = wrap(self.heading + turn * self.dt - yaw).clamp(-0.35, 0.35)
         self.heading = wrap(yaw + lead)
         sole = self._soles(robots)
-        p, swinging = sole[rows, stance], sole[rows, swing]
+        # A foot that is late keeps aiming at its foothold until it touches the ground.
+        self.planted = torch.where(
+            start[:, None], torch.where(fresh[:, None], sole[rows, stance], self.foothold), self.planted
+        )
+        landed = robots.touch[:, robots.feet][rows, stance] | fresh
+        self.landed = torch.where(start, landed, self.landed | landed)
+        p = torch.where(self.landed[:, None], sole[rows, stance], self.planted)
+        swinging = sole[rows, swing]
         reach = p[:, 2] + 0.5
         under = ground(sole[..., :2], reach[:, None])
         mean = under.mean(1)
@@ -197,8 +220,8 @@ class Walker:
         left = (1.0 - phase) * self.duration
         x = robots.com[:, :2] - p[:, :2]
         xi = (x + robots.com_velocity[:, :2] / self.w) * torch.exp(self.w * left)[:, None]
-        landing = self.heading + command[:, 2] * left
-        step = turn_xy(xi, -landing) - capture_offset(command[:, :2], -side, self.duration, s.width, self.w)
+        landing = self.heading + turn * left
+        step = turn_xy(xi, -landing) - capture_offset(speed, -side, self.duration, s.width, self.w)
         ahead = step[:, 0].clamp(*s.reach_forward)
         beside = (-side * step[:, 1]).clamp(*s.reach_side)
         aim = p[:, :2] + turn_xy(torch.stack([ahead, -side * beside], dim=-1), landing)
@@ -214,7 +237,10 @@ class Walker:
         apex = torch.maximum(ground(way, reach[:, None]).amax(1), self.lift[:, 2]) + s.clearance
         rise = self.lift[:, 2] + (apex - self.lift[:, 2]) * smoothstep(t / 0.45)
         fall = apex + (self.foothold[:, 2] - apex) * smoothstep((t - 0.55) / 0.45)
-        across = self.lift[:, :2] + (self.foothold - self.lift)[:, :2] * smoothstep((t - 0.1) / 0.85)[:, None]
+        across = (
+            self.lift[:, :2]
+            + (self.foothold - self.lift)[:, :2] * smoothstep((t - 0.1) / (s.swing_across - 0.1))[:, None]
+        )
         foot = torch.cat([across, torch.where(t < 0.5, rise, fall)[:, None]], dim=1)
 
         # Pelvis: from the mean height of the feet at the start of the step to that at its end.
@@ -222,10 +248,10 @@ class Walker:
         between = (under[rows, stance] - self.foothold[:, 2]).abs()
         height = s.pelvis + self.base + (after - self.base) * smoothstep(phase) - s.sink * between
 
-        com, com_velocity = orbit(command[:, :2], side, phase * self.duration, self.duration, s.width, self.w)
+        com, com_velocity = orbit(self.command[:, :2], side, phase * self.duration, self.duration, s.width, self.w)
         pull = turn_xy(com + com_velocity / self.w, self.heading) - x - robots.com_velocity[:, :2] / self.w
         pull = s.pull * pull.clamp(-0.1, 0.1)
-        joints = self._inverse(robots, rows, stance, swing, sole, foot, height, pull, landing, ground, reach)
+        joints = self._inverse(robots, rows, stance, swing, sole, p, foot, height, pull, landing, ground, reach)
         self.clock = (self.clock + 1) % (2 * s.step_ticks)
         return Reference(
             side, phase, joints, self._weight(robots, rows, stance, swing, sole, phase), com, com_velocity, height,
@@ -233,14 +259,14 @@ class Walker:
         )  # fmt: skip
 
     def _inverse(
-        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, foot: Tensor,
+        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, planted: Tensor, foot: Tensor,
         height: Tensor, pull: Tensor, landing: Tensor, ground: HeightMap, reach: Tensor,
     ) -> Tensor:  # fmt: skip
         """Leg joints: the swing foot placed from the pelvis as it is, the stance leg under the pelvis as wanted."""
         n = len(rows)
         half = FOOT_LENGTH / 2
         feet = sole.clone()
-        feet[rows, swing] = foot
+        feet[rows, stance], feet[rows, swing] = planted, foot
         foot_yaw = torch.atan2(robots.ankle_rotation[..., 1, 0], robots.ankle_rotation[..., 0, 0])
         foot_yaw[rows, swing] = landing
         centre = feet.clone()
@@ -262,14 +288,19 @@ class Walker:
         turn[rows, stance], turn[rows, swing] = wanted, body
         forward = robots.velocity[:, :2] * self.dt
         pelvis = torch.cat([robots.pelvis[:, :2] + forward, robots.pelvis[:, 2:]], dim=1)[:, None].repeat(1, 2, 1)
-        pelvis[rows, stance, 2] = height
+        sag = (height - robots.pelvis[:, 2]).clamp(-0.08, 0.08)
+        pelvis[rows, stance, 2] = height + self.spec.height_gain * sag
         pelvis[rows, stance, :2] += pull
         ankle = feet - feet_turn @ torch.tensor(SOLE)
         inverse = turn.transpose(-1, -2)
-        self.joints = self.legs.inverse((inverse @ (ankle - pelvis)[..., None])[..., 0], inverse @ feet_turn, self.joints)
+        self.joints = self.legs.inverse(
+            (inverse @ (ankle - pelvis)[..., None])[..., 0], inverse @ feet_turn, self.joints
+        )
         return self.joints
 
-    def _weight(self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, phase: Tensor) -> Tensor:
+    def _weight(
+        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, phase: Tensor
+    ) -> Tensor:
         """Joint torques (n, 2, 6) that hold the ground force of the pendulum on each foot, N m."""
         share = torch.empty(len(rows), 2)
         share[rows, stance] = (0.5 + 2.5 * phase).clamp(max=1.0)

@@ -15,7 +15,7 @@ from romnav.robot.locomotion.clf import Clf
 from romnav.robot.locomotion.legs import Legs
 from romnav.robot.locomotion.lip import Reference, Walker, turn_xy, wrap
 from romnav.robot.locomotion.terrain import Ground, HeightMap, Lane, steer
-from romnav.robot.spec import GaitSpec, LocomotionSpec
+from romnav.robot.spec import LocomotionSpec
 
 SCAN = tuple((x, y) for y in (-0.15, 0.15) for x in np.linspace(-0.4, 1.0, 15))
 """Height scan ahead of and beside the pelvis in the heading frame, m."""
@@ -54,11 +54,12 @@ class Controller:
         side = torch.where(clock < gait.step_ticks, 1.0, -1.0)
         w = self.walker.w
         sway = side * gait.width / 2 * w * np.tanh(w * self.walker.duration / 2)
-        velocity = torch.stack([0.5 * command[:, 0], sway + 0.5 * command[:, 1]], dim=1)
+        start = 0.5 * command[:, :2].clamp(-0.5, 0.5)
+        velocity = start + torch.stack([torch.zeros(k), sway], dim=1)
         qvel = torch.zeros(k, 6 + TARGETS)
         qvel[:, :2] = turn_xy(velocity, heading)
         self.robots.set_state(ids, qpos, qvel)
-        self.walker.reset(ids, clock, heading)
+        self.walker.reset(ids, clock, heading, start)
         self.action[ids] = 0.0
 
     def refer(self, command: Tensor, ground: HeightMap, first: Tensor) -> Reference:
@@ -111,12 +112,12 @@ class Controller:
     def state_dict(self) -> dict[str, Any]:
         """State besides the robots'."""
         w = self.walker
-        names = ("clock", "lift", "foothold", "base", "heading", "joints")
+        names = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "joints")
         return {name: getattr(w, name).clone() for name in names} | {"action": self.action.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        for name in ("clock", "lift", "foothold", "base", "heading", "joints"):
+        for name in ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "joints"):
             setattr(self.walker, name, state[name].clone())
         self.action = state["action"].clone()
 
@@ -166,7 +167,9 @@ def augment(env: VecEnv, obs: TensorDict | None, actions: Tensor | None) -> tupl
     return obs, actions
 
 
-def tracking_error(robots: Humanoids, ref: Reference, foot_rate: Tensor, height_rate: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+def tracking_error(
+    robots: Humanoids, ref: Reference, foot_rate: Tensor, height_rate: Tensor, turn: Tensor
+) -> tuple[Tensor, Tensor]:
     """Errors and their rates (n, 11) of the outputs: centre of mass (2), height, tilt and yaw (3), swing sole (3),
     its roll and pitch (2).
 
@@ -227,12 +230,22 @@ class LocomotionEnv(VecEnv):
         n = t.robots
         self.level = torch.zeros(n, dtype=torch.long)
         self.lane = torch.zeros(n, dtype=torch.long)
-        self.arc, self.start, self.forward, self.speed = torch.zeros(n), torch.zeros(n), torch.ones(n), torch.zeros(n)
+        self.arc, self.start, self.forward, self.speed = (
+            torch.zeros(n),
+            torch.zeros(n),
+            torch.ones(n),
+            torch.zeros(n),
+        )
         self.command = torch.zeros(n, 3)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
         self.average = torch.zeros(n, 3)
         self.value, self._slope, self._reward = torch.zeros(n), torch.zeros(n), torch.zeros(n)
-        self._last = {"action": torch.zeros(n, TARGETS), "sole": torch.zeros(n, 3), "swing": torch.zeros(n, 3), "height": torch.zeros(n)}
+        self._last = {
+            "action": torch.zeros(n, TARGETS),
+            "sole": torch.zeros(n, 3),
+            "swing": torch.zeros(n, 3),
+            "height": torch.zeros(n),
+        }
         self.friction = self._uniform(*t.friction)
         self.payload = self._uniform(*t.payload)
         self.robots.randomize(self.friction, self.payload)
@@ -246,7 +259,14 @@ class LocomotionEnv(VecEnv):
     def _new_commands(self, ids: Tensor) -> None:
         t = self.spec.task
         k = len(ids)
-        draw = torch.stack([self._uniform(*t.forward, k), self._uniform(-t.lateral, t.lateral, k), self._uniform(-t.turn, t.turn, k)], 1)
+        draw = torch.stack(
+            [
+                self._uniform(*t.forward, k),
+                self._uniform(-t.lateral, t.lateral, k),
+                self._uniform(-t.turn, t.turn, k),
+            ],
+            1,
+        )
         # A tenth stands still, a third each walks straight or does not turn, a fifth is at the corners.
         u = self._uniform(0.0, 1.0, k)
         draw[u < 0.1] = 0.0
@@ -403,7 +423,21 @@ class LocomotionEnv(VecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides the future of the run."""
-        names = ("level", "lane", "arc", "start", "forward", "speed", "command", "episode_length_buf", "average", "value", "_slope", "_reward", "first")
+        names = (
+            "level",
+            "lane",
+            "arc",
+            "start",
+            "forward",
+            "speed",
+            "command",
+            "episode_length_buf",
+            "average",
+            "value",
+            "_slope",
+            "_reward",
+            "first",
+        )
         return {
             "robots": self.robots.state_dict(), "control": self.control.state_dict(),
             "reference": self.control.reference, "random": self.random.get_state(),

@@ -136,8 +136,8 @@ def rough(level: int, amplitude: float, rng: np.random.Generator) -> Lane:
 
 
 def flat(level: int = 0) -> Lane:
-    """Level ground; its path is only a place to start from."""
-    return Lane("flat", level, np.array([[0.0, 0.0], [1.0, 0.0]]), [], (0.5,))
+    """Level ground; its path is only a place to start from, out of reach of the other lanes."""
+    return Lane("flat", level, np.array([[-60.0, 0.0], [-59.0, 0.0]]), [], (0.5,))
 
 
 def curriculum(rng: np.random.Generator) -> list[Lane]:
@@ -173,7 +173,9 @@ class Ground:
             high = max([s.y1 for s in lane.slabs], default=1.2)
             offsets.append(y - low)
             y += high - low + 1.0
-        far = max([s.x1 for lane in lanes for s in lane.slabs] + [float(lane.path[:, 0].max()) for lane in lanes])
+        far = max(
+            [0.0] + [s.x1 for lane in lanes for s in lane.slabs] + [float(lane.path[:, 0].max()) for lane in lanes]
+        )
         origin = np.array([-4.0, -4.0])
         shape = np.ceil((np.array([far + 4.0, y + 4.0]) - origin) / cell).astype(int)
         heights = np.zeros(shape)
@@ -197,7 +199,9 @@ class Ground:
                 x = origin[0] + (np.arange(i0, i1) + 0.5) * cell
                 top = s.z0 + (x - s.x0) / (s.x1 - s.x0) * (s.z1 - s.z0)
                 heights[i0:i1, j0:j1] = np.maximum(heights[i0:i1, j0:j1], top[:, None])
-        self.boxes = Boxes(np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3), np.array(quat).reshape(-1, 4))
+        self.boxes = Boxes(
+            np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3), np.array(quat).reshape(-1, 4)
+        )
         self.map = HeightMap(
             torch.tensor(origin, dtype=torch.float32), cell, torch.tensor(heights, dtype=torch.float32)[None]
         )
@@ -237,7 +241,9 @@ class Ground:
         return tries.gather(1, best)[:, 0].clamp(min=0.0).minimum(self.length[lane])
 
 
-def steer(ground: Ground, lane: Tensor, arc: Tensor, forward: Tensor, point: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
+def steer(
+    ground: Ground, lane: Tensor, arc: Tensor, forward: Tensor, point: Tensor, heading: Tensor, speed: Tensor
+) -> Tensor:
     """Velocity command (n, 3) that follows a path: pursue a point 0.7 m ahead, slow down where it bends away."""
     ahead = ground.at(lane, arc + 0.7 * forward)
     # Beyond the end of the path, keep its direction.
@@ -247,4 +253,7 @@ def steer(ground: Ground, lane: Tensor, arc: Tensor, forward: Tensor, point: Ten
     to = ahead + end * over[:, None] - point
     error = torch.atan2(to[:, 1], to[:, 0]) - heading
     error = torch.atan2(torch.sin(error), torch.cos(error))
-    return torch.stack([speed * torch.cos(error).clamp(min=0.2), torch.zeros_like(error), (2.0 * error).clamp(-1.0, 1.0)], dim=1)
+    return torch.stack(
+        [speed * torch.cos(error).clamp(min=0.2), torch.zeros_like(error), (2.0 * error).clamp(-1.0, 1.0)],
+        dim=1,
+    )
