@@ -9,6 +9,8 @@ practice", JAIR 2016). Visibility is decided in integers, so there is no lattice
 rounding to `UNIT`.
 """
 
+# ruff: noqa: UP018, RUF046 - in Warp, int() and float() declare variables that change in a loop
+
 from __future__ import annotations
 
 import os
@@ -137,9 +139,9 @@ def nearest(f: Frontier, w: int):
     slot = int(0)
     while 2 * slot + 1 < size:
         below = 2 * slot + 1
-        if below + 1 < size:
-            if f.distance[w, f.heap[w, below + 1]] < f.distance[w, f.heap[w, below]]:
-                below += 1
+        other = f.heap[w, wp.min(below + 1, size - 1)]
+        if f.distance[w, other] < f.distance[w, f.heap[w, below]]:
+            below += 1
         other = f.heap[w, below]
         if distance <= f.distance[w, other]:
             break
@@ -158,9 +160,7 @@ def length(s: Surface, x: int, y: int):
 
 
 @wp.func
-def expand(
-    s: Surface, f: Frontier, w: int, origin: int, source: int, x: int, start: float, cone: Cone, up: int
-):
+def expand(s: Surface, f: Frontier, w: int, origin: int, source: int, x: int, start: float, cone: Cone, up: int):
     """Light what a source at column ``x``, ``start`` metres from the goal, sees in ``cone``; 0: rows go up, 1: down."""
     sign = 1 - 2 * up
     over = 2 - 2 * up
