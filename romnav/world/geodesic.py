@@ -425,7 +425,6 @@ def _surface(grids: Grids) -> dict[str, NDArray[np.int32]]:
     original = np.lexsort((iy, first))
     number = np.append(np.argsort(original), -1)
     link = number[link[original]]
-    nodes = np.arange(len(link))
     above = link[:, UP:]
 
     corner = np.full((len(link), 4), -1)
