@@ -70,9 +70,7 @@ def visible(free: NDArray[np.bool_], start: tuple[int, int], end: tuple[int, int
             ring = [(i - 1, j - 1), (i, j - 1), (i, j), (i - 1, j)]
             reached = before & set(ring)
             for _ in range(3):
-                reached |= {
-                    c for k, c in enumerate(ring) if is_free(c) and {ring[k - 1], ring[k - 3]} & reached
-                }
+                reached |= {c for k, c in enumerate(ring) if is_free(c) and {ring[k - 1], ring[k - 3]} & reached}
             if not reached & cells:
                 return False
         before = cells
@@ -115,9 +113,7 @@ def test_equals_the_visibility_graph_on_a_larger_grid() -> None:
     goals = [0]
     exact = visibility_graph(free, goals)
     near = np.isfinite(exact)
-    np.testing.assert_allclose(
-        fields(flat(free), np.array(goals))[near] * UNIT, exact[near], rtol=0, atol=UNIT
-    )
+    np.testing.assert_allclose(fields(flat(free), np.array(goals))[near] * UNIT, exact[near], rtol=0, atol=UNIT)
 
 
 def test_free_space_is_euclidean() -> None:
@@ -138,9 +134,7 @@ def stairs() -> Grids:
     builder.box((6.0, 6.0), (12.0, 12.0), (-0.2, 0.0), label=Label.GROUND, layers=(0, 0))
     builder.box((9.0, 6.0), (6.0, 12.0), (2.8, 3.0), label=Label.GROUND, layers=(1, 1))
     for k in range(20):
-        builder.box(
-            (3.15 + 0.3 * k * 0.5, 6.0), (0.15, 2.0), (-0.1, 0.15 * (k + 1)), label=Label.STAIR, layers=(0, 1)
-        )
+        builder.box((3.15 + 0.3 * k * 0.5, 6.0), (0.15, 2.0), (-0.1, 0.15 * (k + 1)), label=Label.STAIR, layers=(0, 1))
     tile = Tile(TileClass.BUILDING, 0, 12.0, builder.build(), (0.0, 3.0), (0, 1), ())
     return rasterise(tile, GridSpec(max_step=0.35))
 
@@ -166,9 +160,7 @@ def test_reaches_the_floor_above_only_over_the_stairs(stairs: Grids) -> None:
 def world() -> World:
     spec = WorldSpec(tiles=3, goals_per_tile=12)
     grids = [generate(spec, i) for i in range(spec.tiles)]
-    goals = [
-        np.random.default_rng(i).choice(len(g.position), 12, replace=False) for i, (_, g) in enumerate(grids)
-    ]
+    goals = [np.random.default_rng(i).choice(len(g.position), 12, replace=False) for i, (_, g) in enumerate(grids)]
     return pack(spec, [t for t, _ in grids], [g for _, g in grids], goals)
 
 
@@ -179,9 +171,7 @@ def test_is_a_metric(world: World) -> None:
         assert (np.diag(d) == 0).all()
         assert np.abs(d - d.T).max() <= 1
         assert (d[:, :, None] <= d[:, None, :] + d.T[None] + 2).all()
-        straight = np.linalg.norm(
-            grids.position[nodes][:, None, :2] - grids.position[nodes][None, :, :2], axis=2
-        )
+        straight = np.linalg.norm(grids.position[nodes][:, None, :2] - grids.position[nodes][None, :, :2], axis=2)
         assert (d * UNIT >= straight - UNIT).all()
 
 
@@ -240,9 +230,7 @@ def test_lookup_is_continuous(world: World) -> None:
     lookup = GeodesicLookup(world)
     tile, layer, xy, goal, _, _ = scatter(world, 4000, 1)
     before, _ = lookup(tile, layer, xy, goal)
-    step = 0.02 * torch.nn.functional.normalize(
-        torch.randn(4000, 2, generator=torch.Generator().manual_seed(2)), dim=1
-    )
+    step = 0.02 * torch.nn.functional.normalize(torch.randn(4000, 2, generator=torch.Generator().manual_seed(2)), dim=1)
     free = world.node_at(tile, layer, xy + step) >= 0
     after, _ = lookup(tile, layer, xy + step, goal)
     jump = (after - before).abs()[free] - 0.02
