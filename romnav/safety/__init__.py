@@ -1,1 +1,1 @@
-"""Poisson safety filter: point cloud or occupancy grid in, safe velocity out. Usable without the rest of romnav."""
+"""Poisson safety filter: point cloud or occupancy grid in, safe velocity out. Usable alone."""

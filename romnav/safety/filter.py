@@ -1,11 +1,11 @@
 """Control-barrier-function filter on a Poisson safety function, and the whole way from points to command.
 
-The continuous filter is the paper's quadratic program (Sec. "Poisson Safety Filter"): the velocity nearest to the
-desired one with ``grad h . v >= -alpha h``, solved in closed form. A command is held for a control period, though,
-over which ``h`` bends; so the displacement is then followed through the grid, where bilinear ``h`` is a quadratic
-along a straight line within each patch, and the command is scaled back to the first instant at which less than
-a fixed share of ``h`` would remain. That keeps ``h`` positive at every instant, not only at the samples, and needs
-no Lipschitz constant.
+The continuous filter is the paper's quadratic program (Sec. "Poisson Safety Filter"): the velocity nearest to
+the desired one with ``grad h . v >= -alpha h``, solved in closed form. A command is held for a control
+period, though, over which ``h`` bends; so the displacement is then followed through the grid, where bilinear
+``h`` is a quadratic along a straight line within each patch, and the command is scaled back to the first
+instant at which less than a fixed share of ``h`` would remain. That keeps ``h`` positive at every instant,
+not only at the samples, and needs no Lipschitz constant.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def _clamp(x: wp.vec2d, lower: wp.vec2d, upper: wp.vec2d):
 def _cbf_qp(desired: wp.vec2d, normal: wp.vec2d, bound: wp.float64, lower: wp.vec2d, upper: wp.vec2d):
     """Nearest velocity in the box with ``normal . v >= bound``, and whether there is one.
 
-    If the box's own nearest point misses the half-plane, the optimum lies on the line ``normal . v = bound``: the
-    foot of the desired velocity there, clamped to the piece of the line within the box. Without such a piece, the
-    corner that violates the condition least.
+    If the box's own nearest point misses the half-plane, the optimum lies on the line ``normal . v = bound``:
+    the foot of the desired velocity there, clamped to the piece of the line within the box. Without such a
+    piece, the corner that violates the condition least.
     """
     v = _clamp(desired, lower, upper)
     if wp.dot(normal, v) >= bound:
@@ -111,7 +111,7 @@ def _value(h: wp.array3d(dtype=float), b: int, x: wp.vec2d):
 
 @wp.func
 def _slope(h: wp.array3d(dtype=float), b: int, x: wp.vec2d, last: wp.vec2d):
-    """Central difference over one cell: the bilinear gradient in the middle of a patch, and continuous elsewhere.
+    """Central difference over one cell: the bilinear gradient in the middle of a patch, continuous elsewhere.
 
     The bilinear gradient itself jumps where patches meet, and a robot would get caught on the seams.
     """
@@ -172,7 +172,7 @@ def _safe_share(
 ):
     """Share of the displacement d (in cells, from x) up to which h stays above the target.
 
-    A robot on its way out of an obstacle must not fall back into one. The grid's outermost nodes are never reached.
+    A robot on its way out of an obstacle must not fall back into one. The outermost nodes are never reached.
     """
     cell = wp.vec2i(wp.min(int(x[0]), h.shape[1] - 2), wp.min(int(x[1]), h.shape[2] - 2))
     s = wp.float64(0.0)
@@ -248,7 +248,7 @@ def _filter(
     target = wp.where(touches, value, retain * value)
     share = _safe_share(h, b, x, v * (period / cell), target, touches, retain)
     if touches and share < wp.float64(1.0):
-        # Along what is wanted there is no way out that lasts; so straight out, free of the wish and of small dips.
+        # What is wanted leads out nowhere, so straight out; a dip on the way does not matter inside.
         v, feasible = _cbf_qp(wp.vec2d(), slope, bound, lower, upper)
         target = wp.where(value > wp.float64(0.0), value, -_INF)
         share = _safe_share(h, b, x, v * (period / cell), target, touches, retain)
@@ -297,8 +297,8 @@ def cbf_qp(
         upper: Largest velocity; unlimited by default.
 
     Returns:
-        velocity (K, 2) and feasible (K,). Where nothing is feasible, the velocity in the box that violates the
-        half-plane least.
+        velocity (K, 2) and feasible (K,). Where nothing is feasible, the velocity in the box that violates
+        the half-plane least.
     """
     device = str(desired.device)
     velocity = torch.empty(len(desired), 2, dtype=torch.float64, device=device)
@@ -347,8 +347,8 @@ def filter_velocity(
     """Nearest velocity that keeps h positive for one control period.
 
     Args:
-        h: (B, rows, columns) safety function on cell centres, as of `PoissonSolver.solve`; any other function that
-            is positive in free space will do.
+        h: (B, rows, columns) safety function on cell centres, as of `PoissonSolver.solve`; any other function
+            that is positive in free space will do.
         cell: Side of a cell, m.
         position: (B, 2) from the centre of cell (0, 0), along rows and columns, m.
         velocity: (B, 2) desired velocity in the grid's axes, m/s.
@@ -394,7 +394,7 @@ def filter_velocity(
 class SafetyFilter:
     """Point clouds and desired velocities of ``robots`` robots in, safe velocities out.
 
-    Each robot's result depends on its own inputs and its own previous calls only, whatever the number of workers.
+    A robot's result depends on its own inputs and previous calls only, whatever the number of workers.
 
     Args:
         robots: Number of robots.
@@ -403,9 +403,7 @@ class SafetyFilter:
         workers: Threads (CPU); kernels release the interpreter lock.
     """
 
-    def __init__(
-        self, robots: int, spec: SafetySpec | None = None, device: str = "cpu", workers: int = 1
-    ) -> None:
+    def __init__(self, robots: int, spec: SafetySpec | None = None, device: str = "cpu", workers: int = 1) -> None:
         self.spec = spec = spec or SafetySpec()
         # A few robots at a time keep their grids in a core's cache; a GPU takes all at once.
         share = min(robots, 4) if wp.get_device(device).is_cpu else robots
@@ -420,28 +418,22 @@ class SafetyFilter:
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
 
     def reset(self, robots: torch.Tensor | None = None) -> None:
-        """Forget the past of ``robots`` (a bool mask; all of them by default), as after a jump to another place."""
+        """Forget the past of ``robots`` (bool mask; all by default), as after a jump to another place."""
         for chunk, (_, solver) in zip(self._chunks, self._stages, strict=True):
             solver.reset(None if robots is None else robots[chunk])
 
-    def __call__(
-        self, points: torch.Tensor, velocity: torch.Tensor, valid: torch.Tensor | None = None
-    ) -> Filtered:
+    def __call__(self, points: torch.Tensor, velocity: torch.Tensor, valid: torch.Tensor | None = None) -> Filtered:
         """Filter one control period's commands.
 
         Args:
-            points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the ground
-                beneath the robot's centre.
+            points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the
+                ground beneath the robot's centre.
             velocity: (B, 2) desired (vx, vy) in that frame, m/s. The yaw rate passes the filter by.
             valid: (B, N) bool, which returns to use; all by default.
         """
         if velocity.shape != (self._robots, 2):
             raise RomnavError(f"velocity has shape {tuple(velocity.shape)}; expected ({self._robots}, 2)")
-        if (
-            points.ndim != 3
-            or len(points) != self._robots
-            or (valid is not None and valid.shape != points.shape[:2])
-        ):
+        if points.ndim != 3 or len(points) != self._robots or (valid is not None and valid.shape != points.shape[:2]):
             raise RomnavError(
                 f"points are {tuple(points.shape)}, valid {None if valid is None else tuple(valid.shape)}; "
                 f"expected ({self._robots}, N, 3) and ({self._robots}, N)"
@@ -462,8 +454,5 @@ class SafetyFilter:
         indices = range(len(self._chunks))
         parts = list(map(work, indices) if self._pool is None else self._pool.map(work, indices))
         return Filtered(
-            *(
-                torch.cat([getattr(p, name) for p in parts])
-                for name in ("velocity", "status", "h", "gradient")
-            )
+            *(torch.cat([getattr(p, name) for p in parts]) for name in ("velocity", "status", "h", "gradient"))
         )

@@ -1,10 +1,10 @@
 """From a point cloud to a local occupancy grid, inflated by the robot's radius.
 
-The paper rasterises the cloud "after removing the ground" (Sec. "Poisson Safety Filter"). On slopes, stairs and
-landings no plane is the ground, so it is grown here from under the robot's feet over a coarse height map: a
-neighbouring cell belongs to it if its lowest return is within a step, give or take a slope, of it. What is not ground in that sense (a
-table top, the storey below a railing) inherits the ground next to it; a return is an obstacle if it lies more than
-a step above the ground of its cell and lower than the robot's height.
+The paper rasterises the cloud "after removing the ground" (Sec. "Poisson Safety Filter"). On slopes, stairs
+and landings no plane is the ground, so it is grown here from under the robot's feet over a coarse height map:
+a neighbouring cell belongs to it if its lowest return is within a step, give or take a slope, of it. What is
+not ground in that sense (a table top, the storey below a railing) inherits the ground next to it; a return is
+an obstacle if it lies more than a step above the ground of its cell and lower than the robot's height.
 """
 
 from __future__ import annotations
@@ -139,6 +139,22 @@ def _distances(occupied: wp.array3d(dtype=wp.bool), distance: wp.array3d(dtype=i
         distance[b, i, j] = wp.min(distance[b, i, j], since)
 
 
+# A loop over raw memory: it vectorises, and inflation is the longest loop of the module.
+@wp.func_native("""
+    const int* d = distance.data + source;
+    bool* out = inflated.data + target;
+    for (int j = 0; j < count; ++j) out[j] |= d[j] <= width;
+""")
+def _within(
+    distance: wp.array3d(dtype=int),
+    inflated: wp.array3d(dtype=wp.bool),
+    source: int,
+    target: int,
+    count: int,
+    width: int,
+): ...
+
+
 @wp.kernel(enable_backward=False)
 def _dilate(
     distance: wp.array3d(dtype=int),
@@ -146,40 +162,32 @@ def _dilate(
     reach: int,
     inflated: wp.array3d(dtype=wp.bool),
 ):
-    """A cell is in the disc of an occupied cell if in some row the nearest one is within the disc's half width."""
+    """A cell is inflated if in some row the nearest occupied cell is within the disc's half width there."""
     b, i = wp.tid()
+    rows = inflated.shape[1]
     n = inflated.shape[2]
-    for j in range(n):
-        inflated[b, i, j] = False
-    for r in range(wp.max(0, i - reach), wp.min(inflated.shape[1], i + reach + 1)):
-        width = half_width[wp.abs(r - i)]
-        for j in range(n):
-            if distance[b, r, j] <= width:
-                inflated[b, i, j] = True
+    for r in range(wp.max(0, i - reach), wp.min(rows, i + reach + 1)):
+        _within(distance, inflated, (b * rows + r) * n, (b * rows + i) * n, n, half_width[wp.abs(r - i)])
 
 
 def inflate(occupied: torch.Tensor, radius: float) -> torch.Tensor:
-    """Occupancy dilated by an exact disc: all cells whose centre is within ``radius`` of an occupied cell's centre.
+    """All cells whose centre is within ``radius`` of an occupied cell's centre (dilation by an exact disc).
 
     Args:
         occupied: (B, rows, columns) bool.
         radius: In cells.
     """
     if occupied.ndim != 3 or occupied.dtype != torch.bool:
-        raise RomnavError(
-            f"occupancy is {occupied.dtype} {tuple(occupied.shape)}; expected bool (B, rows, columns)"
-        )
+        raise RomnavError(f"occupancy is {occupied.dtype} {tuple(occupied.shape)}; expected bool (B, rows, columns)")
     reach = int(radius)
     # Least squares of integers against the square of the radius: no rounding at the disc's rim.
     widths = [math.isqrt(int(radius * radius + 1e-9) - k * k) for k in range(reach + 1)]
     device = str(occupied.device)
     distance = torch.empty(occupied.shape, dtype=torch.int32, device=device)
-    inflated = torch.empty_like(occupied)
+    inflated = torch.zeros(occupied.shape, dtype=torch.bool, device=device)
     rows = occupied.shape[:2]
     into = wp.from_torch(distance)
-    wp.launch(
-        _distances, dim=rows, inputs=[wp.from_torch(occupied.contiguous())], outputs=[into], device=device
-    )
+    wp.launch(_distances, dim=rows, inputs=[wp.from_torch(occupied.contiguous())], outputs=[into], device=device)
     wp.launch(
         _dilate,
         dim=rows,
@@ -192,7 +200,7 @@ def inflate(occupied: torch.Tensor, radius: float) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Occupancy:
-    """Local occupancy of every robot: rows along x (ahead), columns along y (left), the robot in the middle."""
+    """Local occupancy: rows along x (ahead), columns along y (left), the robot in the middle."""
 
     occupied: torch.Tensor
     """(B, n, n) bool, cells with a return off an obstacle."""
@@ -224,8 +232,8 @@ class Rasterizer:
         self._reach = spec.radius + spec.margin
         if cells * spec.cell <= 4 * self._reach:
             raise RomnavError(
-                f"occupancy.size {spec.size} m is too small for a robot of radius {spec.radius} m and a margin of "
-                f"{spec.margin} m; at least four times their sum is needed"
+                f"occupancy.size {spec.size} m is too small for a robot of radius {spec.radius} m and a margin "
+                f"of {spec.margin} m; at least four times their sum is needed"
             )
         self.shape = (cells, cells)
         self.centre = (cells - 1) * spec.cell / 2
@@ -240,8 +248,8 @@ class Rasterizer:
         """Rasterise one cloud per robot.
 
         Args:
-            points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the ground
-                beneath the robot's centre.
+            points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the
+                ground beneath the robot's centre.
             valid: (B, N) bool, which returns to use (padding is invalid); all by default.
         """
         if points.ndim != 3 or len(points) != self._robots or points.shape[2] != 3:
@@ -250,9 +258,7 @@ class Rasterizer:
         if valid is None:
             valid = torch.ones(points.shape[:2], dtype=torch.bool, device=device)
         if valid.shape != points.shape[:2] or valid.dtype != torch.bool:
-            raise RomnavError(
-                f"valid is {valid.dtype} {tuple(valid.shape)}; expected bool {tuple(points.shape[:2])}"
-            )
+            raise RomnavError(f"valid is {valid.dtype} {tuple(valid.shape)}; expected bool {tuple(points.shape[:2])}")
         cloud = wp.from_torch(points.float().contiguous(), dtype=wp.vec3)
         mask = wp.from_torch(valid.contiguous())
         used, broken = torch.zeros(2, self._robots, dtype=torch.int32, device=device)

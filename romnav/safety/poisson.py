@@ -1,10 +1,11 @@
 """Poisson safety functions on occupancy grids, batched over robots.
 
-The safety function ``h`` solves ``Lap h = -P / A`` in free space and ``Lap h = +P / A`` inside obstacles, with
-``h = 0`` on the boundary between them and on the edge of the grid (paper, "Poisson Safety Filter"; Bahati et al.,
-arXiv 2505.06794; Bena et al., arXiv 2508.11129). ``A`` is the area of free space and ``P`` the length of its
-boundary: by the divergence theorem the mean slope of ``h`` over the boundary is one ("average flux"), so near an
-obstacle ``h`` reads like a distance in metres. The barrier condition is homogeneous in ``h``; its scale is free.
+The safety function ``h`` solves ``Lap h = -P / A`` in free space and ``Lap h = +P / A`` inside obstacles,
+with ``h = 0`` on the boundary between them and on the edge of the grid (paper, "Poisson Safety Filter";
+Bahati et al., arXiv 2505.06794; Bena et al., arXiv 2508.11129). ``A`` is the area of free space and ``P`` the
+length of its boundary: by the divergence theorem the mean slope of ``h`` over the boundary is one ("average
+flux"), so near an obstacle ``h`` reads like a distance in metres. The barrier condition is homogeneous in
+``h``, so that the scale has no effect on a filter.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 # Cells lie at the centres; a boundary is the face between a free and an occupied cell, where h = 0. By linear
-# extrapolation over that face the neighbour of the other phase counts as -h_i, which adds one to the diagonal, so
-# a cell's neighbours of its own phase are all that couple to it. h is positive in one phase and negative in the
-# other, hence the sum over same-phase neighbours is the sum of max(s h_j, 0) with s the sign of the cell, and one
-# signed array per colour is all the memory that a sweep touches. The colours are stored apart, so that the loop
-# is contiguous and vectorises.
+# extrapolation over that face the neighbour of the other phase counts as -h_i, which adds one to the
+# diagonal, so a cell's neighbours of its own phase are all that couple to it. h is positive in one phase and
+# negative in the other, hence the sum over same-phase neighbours is the sum of max(s h_j, 0) with s the sign
+# of the cell, and one signed array per colour is all the memory that a sweep touches. The colours are stored
+# apart, so that the loop is contiguous and vectorises.
 _RELAX = """
     const float* up = h.data + other - stride;
     const float* down = h.data + other + stride;
@@ -76,7 +77,7 @@ def _discretise(
     h: wp.array(dtype=float),
     counts: wp.array(dtype=wp.vec3i),
 ):
-    """One row: reciprocal diagonals, signed by phase; where the iteration starts; what the forcing needs to know.
+    """One row: reciprocal diagonals, signed by phase; the iteration's start; what the forcing needs to know.
 
     The counts are free cells and unlike neighbours along the axes and the diagonals, the outside included.
     """
@@ -98,7 +99,7 @@ def _discretise(
             unlike = wp.abs(here - left) + wp.abs(here - right) + wp.abs(here - above) + wp.abs(here - below)
             diagonal = 4 + unlike
             if here == 0:
-                # An obstacle goes on beyond the edge of the grid: no flux, so it does not lead a robot out there.
+                # An obstacle goes on beyond the edge of the grid: no flux, so that no way out leads there.
                 diagonal -= wp.where(i == 0, 1, 0) + wp.where(i == rows - 1, 1, 0)
                 diagonal -= wp.where(j == 0, 1, 0) + wp.where(j == columns - 1, 1, 0)
             sign = float(2 * here - 1)
@@ -162,8 +163,8 @@ def _unpack(h: wp.array(dtype=float), half: int, plane: int, out: wp.array3d(dty
 class PoissonSolver:
     """Solves for the safety functions of ``robots`` grids of one shape, each from its own previous solution.
 
-    After any number of sweeps ``h`` is positive in exactly the free cells and negative in the others, so that a
-    filter on top of it is safe however far the iteration has come; convergence only shapes ``h``.
+    After any number of sweeps ``h`` is positive in exactly the free cells and negative in the others, so that
+    a filter on top of it is safe however far the iteration has come; convergence only shapes ``h``.
 
     Args:
         robots: Number of grids.
@@ -238,8 +239,8 @@ class PoissonSolver:
             occupied: (robots, rows, columns) bool, inflated by the robot's radius already.
 
         Returns:
-            h (robots, rows, columns), m; a buffer that the next call overwrites. A grid without a free cell has h
-            below zero and no gradient.
+            h (robots, rows, columns), m; a buffer that the next call overwrites. A grid without a free cell
+            has h below zero and no gradient.
         """
         if occupied.shape != self.shape or occupied.dtype != torch.bool:
             raise RomnavError(
