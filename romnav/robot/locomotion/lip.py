@@ -117,9 +117,12 @@ class Reference:
 class Walker:
     """Phase clock, footholds and swing of a batch of robots: turns a velocity command into a `Reference`.
 
-    State per robot: clock, lift-off point, foothold, ground height at the start of the step, heading
-    reference and the last solution of the inverse kinematics.
+    `STATE` names what it remembers of each robot: the clock, where the swing foot left the ground, where it is
+    to land, where the stance foot was to land and whether it has, the mean ground height at the start of the
+    step, the heading and velocity it follows, and the last solution of the inverse kinematics.
     """
+
+    STATE = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "joints")
 
     def __init__(self, spec: GaitSpec, legs: Legs, control_dt: float, count: int) -> None:
         self.spec, self.legs = spec, legs

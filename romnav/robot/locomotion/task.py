@@ -109,17 +109,32 @@ class Controller:
             dim=1,
         )
 
+    def snapshot(self, ids: Tensor) -> dict[str, Tensor]:
+        """State of robots `ids` and of their gait, before `refer`: what `restore` needs to go on walking."""
+        batch, index = self.robots.batch, ids.numpy()
+        state = {name: torch.from_numpy(getattr(batch, name)[index]) for name in ("qpos", "qvel")}
+        return state | {name: getattr(self.walker, name)[ids].clone() for name in Walker.STATE} | {
+            "action": self.action[ids].clone()
+        }
+
+    def restore(self, ids: Tensor, state: dict[str, Tensor]) -> None:
+        """Put robots `ids` into a `snapshot`."""
+        self.robots.set_state(ids, state["qpos"], state["qvel"])
+        for name in Walker.STATE:
+            getattr(self.walker, name)[ids] = state[name]
+        self.action[ids] = state["action"]
+
     def state_dict(self) -> dict[str, Any]:
         """State besides the robots'."""
-        w = self.walker
-        names = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "joints")
-        return {name: getattr(w, name).clone() for name in names} | {"action": self.action.clone()}
+        return {name: getattr(self.walker, name).clone() for name in Walker.STATE} | {
+            "action": self.action.clone(), "reference": self.reference,
+        }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        for name in ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "joints"):
+        for name in Walker.STATE:
             setattr(self.walker, name, state[name].clone())
-        self.action = state["action"].clone()
+        self.action, self.reference = state["action"].clone(), state["reference"]
 
 
 _LEG = ((0, 1), (1, -1), (2, -1), (3, 1), (4, 1), (5, -1))
@@ -362,7 +377,7 @@ class LocomotionEnv(VecEnv):
 
     def fallen(self) -> Tensor:
         """(n,) pelvis too low over the ground, or tipped by more than about 55 degrees."""
-        return has_fallen(self.robots, self.control.reference)
+        return has_fallen(self.robots)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """One control step of all robots; those that are done start again."""
@@ -449,14 +464,13 @@ class LocomotionEnv(VecEnv):
         state = dict(state)
         self.robots.load_state_dict(state.pop("robots"))
         self.control.load_state_dict(state.pop("control"))
-        self.control.reference = state.pop("reference")
         self.random.set_state(state.pop("random"))
         self._last = {k: v.clone() for k, v in state.pop("last").items()}
         for name, value in state.items():
             setattr(self, name, value.clone())
 
 
-def has_fallen(robots: Humanoids, reference: Reference) -> Tensor:
+def has_fallen(robots: Humanoids) -> Tensor:
     """(n,) pelvis less than 0.42 m over the lower foot, or tipped by more than about 55 degrees."""
     low = robots.pelvis[:, 2] - robots.ankle[..., 2].amin(1) < 0.42
     return low | (robots.orientation[:, 2, 2] < 0.57)
