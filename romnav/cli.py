@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import sys
 from collections.abc import Collection
@@ -168,6 +169,26 @@ def tables(
 
 
 @app.command()
+def episodes(
+    ctx: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the new set, a file under experiments/episodes/.")],
+) -> None:
+    """Draw a new set of paired episodes; existing ones are never replaced."""
+    from romnav.evaluation import episodes
+    from romnav.evaluation.spec import EpisodeSetSpec
+    from romnav.experiment.project import Project
+    from romnav.world.world import build
+
+    path = Project.here(ctx.obj).root / "experiments" / "episodes" / f"{name}.json"
+    if path.exists():
+        raise RomnavError(f"{path}: exists, and results refer to it; choose another name")
+    spec = EpisodeSetSpec()
+    drawn = episodes.draw(name, spec, build(spec.world))
+    episodes.save(path, drawn)
+    typer.echo(f"{path}: {len(drawn)} episodes, {drawn.cross.mean():.0%} across levels, hash {drawn.digest}")
+
+
+@app.command()
 def check(ctx: typer.Context, scale: ScaleOption = "smoke") -> None:
     """Hold the results against the bands in results/<scale>/bands.json (nightly regression)."""
     from romnav.experiment.bands import check
@@ -270,12 +291,14 @@ def _print_results(collected: dict[str, Any], arms: list[str], contrasts: bool) 
     chosen = [run for run in collected["arms"] if not arms or run["arm"] in arms]
     tables = [chosen]
     if contrasts:
-        names = {run["arm"] for run in chosen}
-        once = [c for c in collected["contrasts"] if c["a"] < c["b"]]
-        tables.append([c for c in once if {c["a"], c["b"]} <= names])
+        order = list(dict.fromkeys(run["arm"] for run in chosen))
+        once = [
+            c for a, b in itertools.combinations(order, 2) for c in collected["contrasts"] if (c["a"], c["b"]) == (a, b)
+        ]
+        tables.append(once)
     for rows in filter(None, tables):
         table = Table(*rows[0])
         for row in rows:
-            table.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v or "–") for v in row.values()))
+            table.add_row(*(f"{v:.3g}" if isinstance(v, float) else "–" if v is None else str(v) for v in row.values()))
         Console().print(table)
     typer.echo(f"scale {collected['scale']}, episode set {collected['episode_set']}")

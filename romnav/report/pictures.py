@@ -45,7 +45,7 @@ def draw_tile(
     axes = figure.add_subplot(spec[:, 0])
     axes.imshow(render(tile, azimuth, elevation))
     axes.set_axis_off()
-    axes.set_title(f"{tile.kind} {tile.seed}")
+    axes.set_title(f"{tile.kind} {tile.index}")
     for layer in range(layers):
         _draw_grid(figure.add_subplot(spec[layer // columns, 1 + layer % columns]), tile, grids, layer)
     handles = [Patch(color=COLOURS[k], label=k.name.lower()) for k in (Label.GROUND, Label.STAIR, Label.RAMP)]

@@ -335,10 +335,6 @@ def fields(grids: Grids, goals: NDArray[np.integer]) -> NDArray[np.uint16]:
     return solve([grids], [goals])[0].distance
 
 
-def fields_many(tiles: Sequence[Grids], goals: Sequence[NDArray[np.integer]]) -> list[NDArray[np.uint16]]:
-    """`fields` of many tiles at once, on all cores."""
-    return [g.distance for g in solve(tiles, goals)]
-
 
 def solve(
     tiles: Sequence[Grids], goals: Sequence[NDArray[np.integer]], device: str = "cpu", workers: int = 0
@@ -561,8 +557,7 @@ class GeodesicLookup:
         self._world = world
         nodes, goals = world.node_start, world.goal_start
         tile = torch.repeat_interleave(torch.arange(len(world.grids)), goals.diff().cpu())
-        local = (world.goal - nodes[tile]).cpu().numpy()
-        solved = solve(world.grids, np.split(local, goals[1:-1].cpu().numpy()))
+        solved = world.paths
         links = [_links(g) for g in world.grids]
         links = [np.where(link >= 0, link + n, -1) for link, n in zip(links, nodes.tolist(), strict=False)]
         corners = np.cumsum([0] + [len(p.corner) for p in solved])

@@ -46,7 +46,8 @@ class Tile:
     """
 
     kind: TileClass
-    seed: int
+    index: int
+    """Number of the tile within its world."""
     side: float
     solids: Solids
     layers: tuple[float, ...]

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from romnav.world.geodesic import fields_many
+from romnav.world.geodesic import Geodesics, solve
 from romnav.world.grids import Grids
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Tile
@@ -68,6 +68,8 @@ class World:
     """(G,) int64 offset of each goal's field in `fields`."""
     fields: Tensor
     """(sum over goals of the tile's nodes,) uint16 planar geodesic distances, in `geodesic.UNIT`."""
+    paths: tuple[Geodesics, ...]
+    """The same as paths, tile by tile, for `geodesic.GeodesicLookup`."""
 
     @property
     def cell(self) -> float:
@@ -176,7 +178,7 @@ def pack(
         height[t, :n] = g.height
         switch[t, 1:n] = g.switch
         spawn.append(np.flatnonzero(_stair_spawns(tile, g)) + node_start[t])
-    local = fields_many(list(grids), [np.asarray(g) for g in goals])
+    paths = tuple(solve(list(grids), [np.asarray(g) for g in goals]))
     if progress:
         progress(2 * len(tiles), 2 * len(tiles), "geodesic fields")
     per_goal = np.repeat([len(g.position) for g in grids], [len(g) for g in goals])
@@ -197,7 +199,8 @@ def pack(
         goal=torch.from_numpy(np.concatenate([g + s for g, s in zip(goals, node_start, strict=False)])),
         goal_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(g) for g in goals])])),
         field_start=torch.from_numpy(np.concatenate([[0], np.cumsum(per_goal)[:-1]])),
-        fields=torch.from_numpy(np.concatenate([f.ravel() for f in local])),
+        fields=torch.from_numpy(np.concatenate([p.distance.ravel() for p in paths])),
+        paths=paths,
     )
 
 

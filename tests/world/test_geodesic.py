@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from romnav.world.geodesic import GOAL, UNIT, UNREACHABLE, GeodesicLookup, fields, fields_many, solve
+from romnav.world.geodesic import GOAL, UNIT, UNREACHABLE, GeodesicLookup, fields, solve
 from romnav.world.grids import Grids, rasterise
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import GridSpec, WorldSpec
@@ -190,7 +190,7 @@ def test_same_bits_for_any_number_of_workers_and_tiles(world: World) -> None:
         (one,) = solve([grids], [goal], workers=1)
         for name in ("distance", "source", "reach", "corner"):
             np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
-    np.testing.assert_array_equal(fields_many(world.grids, goals)[1], together[1].distance)
+    np.testing.assert_array_equal(solve(world.grids, goals)[1].distance, together[1].distance)
 
 
 def test_sources_give_the_distances(world: World) -> None:

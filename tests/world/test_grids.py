@@ -64,11 +64,11 @@ def test_a_robot_in_a_free_cell_touches_nothing_and_stands_on_something(
             solids = near(tile.solids, where)
             obstacles, terrain = solids[~solids.walkable], solids[solids.walkable]
             column = np.concatenate([np.column_stack([body + where, np.full(49, z + h)]) for h in levels])
-            assert not inside(obstacles, column, 1e-5).any(), (tile.seed, x, y, z)
+            assert not inside(obstacles, column, 1e-5).any(), (tile.index, x, y, z)
             chest = np.column_stack([feet + where, np.full(49, z + 1.0)])
-            assert not inside(terrain, chest, 1e-5).any(), (tile.seed, x, y, z)
+            assert not inside(terrain, chest, 1e-5).any(), (tile.index, x, y, z)
             ground = surface(solids, int(grids.layer[node]), feet + where)
-            assert np.abs(ground - z).max() <= SPEC.max_step + 1e-6, (tile.seed, x, y, z)
+            assert np.abs(ground - z).max() <= SPEC.max_step + 1e-6, (tile.index, x, y, z)
 
 
 @every_class
@@ -97,7 +97,7 @@ def test_an_occupied_cell_beside_free_ones_is_occupied_for_a_reason(
                 drop = not np.ptp(around) <= SPEC.max_step
                 over = [np.column_stack([disc(0.3) + p, np.full(49, z + h)]) for h in (0.4, 0.7, 1.0, 1.4)]
                 roof = inside(solids[solids.walkable], np.concatenate(over)).any()
-                assert hit or drop or roof, (tile.seed, layer, p, z)
+                assert hit or drop or roof, (tile.index, layer, p, z)
                 judged += 1
     assert judged > 150
 

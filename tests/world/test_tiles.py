@@ -81,8 +81,8 @@ def test_a_path_along_each_connector_is_free_and_on_the_surface(name: str, tiles
                 layer = int(np.searchsorted(grids.switch, z))
                 i, j = int(x / grids.cell), int(y / grids.cell)
                 near = (layer, slice(i - 1, i + 2), slice(j - 1, j + 2))
-                assert grids.free[near].any(), (tile.seed, connector.kind, x, y, z)
-                assert np.nanmin(np.abs(grids.height[near] - z)) < 0.2, (tile.seed, connector.kind, x, y, z)
+                assert grids.free[near].any(), (tile.index, connector.kind, x, y, z)
+                assert np.nanmin(np.abs(grids.height[near] - z)) < 0.2, (tile.index, connector.kind, x, y, z)
             assert connector.path[0, 2] < connector.path[-1, 2]
 
 

@@ -64,7 +64,7 @@ def building(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     half = spec.storey_height / 2
     return Tile(
         kind=TileClass.BUILDING,
-        seed=index,
+        index=index,
         side=spec.side,
         solids=solids.build(),
         layers=tuple(half * k for k in range(2 * plan.storeys - 1)),

@@ -72,7 +72,7 @@ def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
         furnish(site.solids, rng, site.floor, plot.frame, plot.size, plot.z, plot.items, count, turn=0.8)
     return Tile(
         kind=TileClass.OUTDOOR,
-        seed=index,
+        index=index,
         side=spec.side,
         solids=site.solids.build(),
         layers=(0.0,),

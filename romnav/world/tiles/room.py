@@ -46,7 +46,7 @@ def room(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     furnish(solids, rng, floor, corner, inner, 0.0, CLUTTER, count, gap=float(rng.uniform(0.75, 1.0)))
     return Tile(
         kind=TileClass.ROOM,
-        seed=index,
+        index=index,
         side=spec.side,
         solids=solids.build(),
         layers=(0.0,),
