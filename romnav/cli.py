@@ -15,7 +15,33 @@ from typer.core import TyperGroup
 from romnav.errors import RomnavError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from romnav.experiment.plan import Plan, Stage
+
+
+RESULT_COLUMNS = {
+    "arm": "arm",
+    "seed": "seed",
+    "sr_45": "SR@45",
+    "sr_45_same": "same",
+    "sr_45_cross": "cross",
+    "sr_120": "SR@120",
+    "t2g": "T2G/s",
+    "spl": "SPL",
+    "falls": "falls",
+}
+CONTRAST_COLUMNS = {
+    "a": "a",
+    "b": "b",
+    "horizon": "s",
+    "level": "level",
+    "diff": "diff",
+    "lo": "lo",
+    "hi": "hi",
+    "n": "n",
+}
 
 
 class _Group(TyperGroup):
@@ -289,16 +315,21 @@ def _print_results(collected: dict[str, Any], arms: list[str], contrasts: bool) 
     from rich.table import Table
 
     chosen = [run for run in collected["arms"] if not arms or run["arm"] in arms]
-    tables = [chosen]
+    _print_table(Console(), Table(title="Success rates in percent"), chosen, RESULT_COLUMNS)
     if contrasts:
         order = list(dict.fromkeys(run["arm"] for run in chosen))
-        once = [
-            c for a, b in itertools.combinations(order, 2) for c in collected["contrasts"] if (c["a"], c["b"]) == (a, b)
-        ]
-        tables.append(once)
-    for rows in filter(None, tables):
-        table = Table(*rows[0])
-        for row in rows:
-            table.add_row(*(f"{v:.3g}" if isinstance(v, float) else "–" if v is None else str(v) for v in row.values()))
-        Console().print(table)
+        pairs = list(itertools.combinations(order, 2))
+        rows = [c for pair in pairs for c in collected["contrasts"] if (c["a"], c["b"]) == pair]
+        title = "Paired differences a - b in percentage points, 95 % intervals"
+        _print_table(Console(), Table(title=title), rows, CONTRAST_COLUMNS)
     typer.echo(f"scale {collected['scale']}, episode set {collected['episode_set']}")
+
+
+def _print_table(console: Console, table: Table, rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
+    for heading in columns.values():
+        table.add_column(heading, justify="left" if heading in ("arm", "a", "b", "level") else "right")
+    for row in rows:
+        values = (row[key] for key in columns)
+        table.add_row(*("–" if v is None else f"{v:.3g}" if isinstance(v, float) else str(v) for v in values))
+    if rows:
+        console.print(table)

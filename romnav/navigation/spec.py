@@ -117,7 +117,7 @@ class PPOSpec(Config):
     """Value-loss coefficient (A)."""
     learning_rate: float = 1e-3
     """Initial learning rate (A)."""
-    learning_rate_range: tuple[float, float] = (1e-4, 2e-3)
+    learning_rate_range: tuple[float, float] = (1e-4, 1e-2)
     """Bounds of the adaptive learning rate (A: small batches measure the KL noisily and would drive it to nothing)."""
     desired_kl: float = 0.01
     """Target of the adaptive learning rate (A)."""
