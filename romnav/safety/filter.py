@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import torch
-import warp as wp
 
 from romnav.errors import RomnavError
+from romnav.kernels import wp
 from romnav.safety.occupancy import Rasterizer
 from romnav.safety.poisson import PoissonSolver
 from romnav.safety.spec import FilterSpec, SafetySpec

@@ -13,13 +13,10 @@ import math
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
 from romnav.errors import RomnavError
+from romnav.kernels import wp
 from romnav.safety.spec import OccupancySpec
-
-wp.config.log_level = wp.LOG_WARNING
-wp.init()
 
 # Occupancy cells along a side of a ground cell: enough returns in each on the ground a few metres away.
 _GROUND_CELLS = wp.constant(2)

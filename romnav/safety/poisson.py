@@ -11,13 +11,10 @@ flux"), so near an obstacle ``h`` reads like a distance in metres. The barrier c
 from __future__ import annotations
 
 import torch
-import warp as wp
 
 from romnav.errors import RomnavError
+from romnav.kernels import wp
 from romnav.safety.spec import PoissonSpec
-
-wp.config.log_level = wp.LOG_WARNING
-wp.init()
 
 # Cells lie at the centres; a boundary is the face between a free and an occupied cell, where h = 0. By linear
 # extrapolation over that face the neighbour of the other phase counts as -h_i, which adds one to the
