@@ -39,7 +39,7 @@ class Status(IntEnum):
     NO_POINTS = 5
     """The cloud is empty: a sensor that sees nothing, not even the ground, sees no obstacle either."""
     NOT_FINITE = 6
-    """A position, a desired velocity or a valid point is NaN or infinite."""
+    """A position, a desired velocity, h or a valid point is NaN or infinite."""
 
 
 # The boundary is where h is this many cells, not zero: far above rounding, far below any clearance.
@@ -220,13 +220,12 @@ def _filter(
     status: wp.array(dtype=int),
 ):
     b = wp.tid()
-    zero = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-    velocity[b] = zero
+    velocity[b] = wp.vec2d()
     level[b] = wp.float64(wp.nan)
-    gradient[b] = zero
+    gradient[b] = wp.vec2d()
     x = position[b] / cell
     wanted = desired[b]
-    if not (wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(wanted[0]) and wp.isfinite(wanted[1])):
+    if not (wp.isfinite(x) and wp.isfinite(wanted)):
         status[b] = wp.static(int(Status.NOT_FINITE))
         return
     last = wp.vec2d(wp.float64(h.shape[1] - 1), wp.float64(h.shape[2] - 1))
@@ -235,6 +234,9 @@ def _filter(
         return
     value = _value(h, b, x)
     slope = _slope(h, b, x, last) / cell
+    if not (wp.isfinite(value) and wp.isfinite(slope)):
+        status[b] = wp.static(int(Status.NOT_FINITE))
+        return
     level[b] = value
     gradient[b] = slope
     bound = alpha * (_TOUCH * cell - value)

@@ -15,13 +15,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.world.solids import Shape, Solids
 
-wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options(
     {
         "enable_backward": False,

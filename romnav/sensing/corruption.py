@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.sensing.spec import CorruptionSpec
 
-wp.config.log_level = wp.LOG_WARNING
-wp.init()
 wp.set_module_options(
     {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": "-march=native -w"}
 )

@@ -8,14 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.sensing import columns
 from romnav.sensing.spec import DepthSpec
 from romnav.world.solids import Solids
 
-wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options({"enable_backward": False})
 
 
@@ -115,7 +114,6 @@ class DepthCamera:
     """(rows, columns, 3), torso frame (x forward, y left, z up): a pixel's point is ``depth * direction``."""
 
     def __init__(self, solids: Sequence[Solids], spec: DepthSpec, device: str = "cpu") -> None:
-        wp.init()
         self.spec = spec
         self.device = device
         across, down = (math.tan(math.radians(f) / 2) for f in spec.field)

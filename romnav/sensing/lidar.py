@@ -9,9 +9,9 @@ from typing import Literal, overload
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.sensing import columns
 from romnav.sensing.spec import LidarSpec
 from romnav.world.mesh import triangulate
@@ -39,7 +39,6 @@ class Lidar:
     """(rows, columns, 3) unit vectors in the levelled LiDAR frame (x forward, y left, z up)."""
 
     def __init__(self, solids: Sequence[Solids], side: float, spec: LidarSpec, device: str = "cpu") -> None:
-        wp.init()
         self.spec = spec
         self.device = device
         width = math.radians(spec.azimuth)

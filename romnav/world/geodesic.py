@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.world.grids import Grids
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ EAST, WEST, UP, DOWN = range(4)
 STEPS = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])
 """(ix, iy) of the links: rows run along iy, in which nodes are numbered."""
 
-wp.config.quiet = True
 wp.set_module_options({"enable_backward": False})
 
 
