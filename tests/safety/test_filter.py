@@ -30,13 +30,9 @@ def qp_cases(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return desired, normal, rng.normal(size=count) * np.linalg.norm(normal, axis=1)
 
 
-def solve_qp(
-    desired: np.ndarray, normal: np.ndarray, bound: np.ndarray, box: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def solve_qp(desired: np.ndarray, normal: np.ndarray, bound: np.ndarray, box: bool) -> tuple[np.ndarray, np.ndarray]:
     limits = (LOWER, UPPER) if box else ()
-    v, feasible = cbf_qp(
-        torch.from_numpy(desired), torch.from_numpy(normal), torch.from_numpy(bound), *limits
-    )
+    v, feasible = cbf_qp(torch.from_numpy(desired), torch.from_numpy(normal), torch.from_numpy(bound), *limits)
     return v.numpy(), feasible.numpy()
 
 
@@ -213,9 +209,7 @@ def test_safe_commands_pass_and_others_move_least(seed, speed, angle):
     desired = np.tile([speed * np.cos(angle), speed * np.sin(angle)], (len(h), 1))
     out = filter_velocity(h, CELL, torch.from_numpy(position), torch.from_numpy(desired), spec)
     v, rate, value = out.velocity.numpy(), (out.gradient.numpy() * desired).sum(1), out.h.numpy()
-    path = level(
-        h.numpy(), position[:, None] + np.linspace(0, 1, 65)[None, :, None] * desired[:, None] * spec.period
-    )
+    path = level(h.numpy(), position[:, None] + np.linspace(0, 1, 65)[None, :, None] * desired[:, None] * spec.period)
     end = position + desired * spec.period
     stays = ((end >= 0) & (end <= 23 * CELL)).all(1)
     safe = (rate > -spec.alpha * value + 1e-3) & (path.min(1) > 0.51 * value) & stays
@@ -238,9 +232,7 @@ def test_gradient_is_that_of_the_interpolated_function():
     ):
         inner = ((x > reach) & (x < 23 * CELL - reach)).all(1)
         x = x[inner]
-        out = filter_velocity(
-            h.expand(len(x), -1, -1), CELL, torch.from_numpy(x), torch.zeros(len(x), 2).double()
-        )
+        out = filter_velocity(h.expand(len(x), -1, -1), CELL, torch.from_numpy(x), torch.zeros(len(x), 2).double())
         np.testing.assert_allclose(out.h, level(field, x[None])[0], atol=1e-9)
         for k, step in enumerate(np.eye(2) * reach):
             slope = (level(field, (x + step)[None]) - level(field, (x - step)[None]))[0] / (2 * reach)
@@ -253,9 +245,7 @@ def test_gradient_converges_to_that_of_the_exact_solution():
     for n in (40, 160):
         x = (np.arange(n) + 0.5) * 2 / n - 1
         free = np.hypot(x[:, None], x) < 0.9
-        h = PoissonSolver(1, (n, n), 2 / n, PoissonSpec(cold_sweeps=3000)).solve(
-            torch.from_numpy(~free)[None]
-        )
+        h = PoissonSolver(1, (n, n), 2 / n, PoissonSpec(cold_sweeps=3000)).solve(torch.from_numpy(~free)[None])
         rng = np.random.default_rng(0)
         r, angle = rng.uniform(0.1, 0.8, 300), rng.uniform(0, 2 * np.pi, 300)
         point = np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
@@ -273,9 +263,7 @@ def test_passes_a_gap_of_three_cells():
     h = PoissonSolver(1, (40, 40), CELL).solve(occupied)
     position = torch.tensor([[10 * CELL, 20 * CELL]], dtype=torch.double)
     for _ in range(100):
-        position += (
-            0.2 * filter_velocity(h, CELL, position, torch.tensor([[0.5, 0.0]], dtype=torch.double)).velocity
-        )
+        position += 0.2 * filter_velocity(h, CELL, position, torch.tensor([[0.5, 0.0]], dtype=torch.double)).velocity
     assert position[0, 0] > 28 * CELL
 
 
@@ -321,11 +309,7 @@ def test_closed_loop_from_points_keeps_clear_of_them():
     poles[near] = 9.0
     position, yaw, closest, travelled = np.zeros((robots, 2)), rng.uniform(0, 6, robots), np.inf, 0.0
     for _ in range(60):
-        v = (
-            filter_(cloud(poles, yaw, position), torch.tensor([[1.0, 0.0]]).expand(robots, 2))
-            .velocity.double()
-            .numpy()
-        )
+        v = filter_(cloud(poles, yaw, position), torch.tensor([[1.0, 0.0]]).expand(robots, 2)).velocity.double().numpy()
         c, s = np.cos(yaw), np.sin(yaw)
         step = 0.2 * np.stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]], 1)
         for share in np.linspace(0, 1, 5):
@@ -377,6 +361,17 @@ def test_nothing_to_go_by_stops_the_robot():
     out = filter_velocity(h, CELL, position, torch.ones(3, 2))
     assert out.status.tolist() == [Status.BLOCKED, Status.OUTSIDE, Status.NOT_FINITE]
     assert (out.velocity == 0).all()
+
+
+def test_h_that_is_not_finite_stops_the_robot():
+    h = torch.ones(2, 10, 10)
+    h[0, 4:6, 4:6] = torch.nan
+    h[1, 6, :] = torch.nan
+    position = torch.tensor([[4.5 * CELL, 4.5 * CELL], [4.5 * CELL, 4.5 * CELL]])
+    out = filter_velocity(h, CELL, position, torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
+    assert out.status.tolist() == [Status.NOT_FINITE, Status.FILTERED]
+    assert (out.velocity[0] == 0).all()
+    assert (position[1] + 0.2 * out.velocity[1])[0] <= 5 * CELL + 1e-6
 
 
 def test_never_leaves_the_grid():

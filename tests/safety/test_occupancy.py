@@ -23,9 +23,7 @@ def patch(x: tuple[float, float], y: tuple[float, float], height, spacing: float
     return np.stack([xs, ys, np.broadcast_to(height(xs), xs.shape)], -1).reshape(-1, 3).astype(float)
 
 
-def wall(
-    x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], spacing: float = 0.04
-) -> np.ndarray:
+def wall(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], spacing: float = 0.04) -> np.ndarray:
     """Points of an upright rectangle between two corners."""
     t, zs = np.meshgrid(np.linspace(0, 1, 60), np.arange(*z, spacing))
     return np.stack([x[0] + t * (x[1] - x[0]), y[0] + t * (y[1] - y[0]), zs], -1).reshape(-1, 3)
@@ -35,9 +33,7 @@ def visible(points: np.ndarray) -> np.ndarray:
     """What a scanner at eye height sees ahead: 220 degrees, no steeper than 55 degrees down."""
     d = points - [0, 0, EYE]
     r = np.hypot(d[:, 0], d[:, 1])
-    return points[
-        (np.abs(np.arctan2(d[:, 1], d[:, 0])) < np.radians(110)) & (d[:, 2] > -np.tan(np.radians(55)) * r)
-    ]
+    return points[(np.abs(np.arctan2(d[:, 1], d[:, 0])) < np.radians(110)) & (d[:, 2] > -np.tan(np.radians(55)) * r)]
 
 
 def rasterise(*surfaces: np.ndarray, noise: float = 0.0, spec: OccupancySpec | None = None):

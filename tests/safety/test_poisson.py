@@ -88,9 +88,7 @@ def direct(occupied: np.ndarray, cell: float) -> np.ndarray:
     rows, columns = occupied.shape
     outside = np.pad(occupied, 1, constant_values=True)
     axis = sum((outside != np.roll(outside, 1, k)).sum() for k in (0, 1))
-    diagonal = sum((outside[1:, 1:] != outside[:-1, :-1]).ravel()) + sum(
-        (outside[1:, :-1] != outside[:-1, 1:]).ravel()
-    )
+    diagonal = sum((outside[1:, 1:] != outside[:-1, :-1]).ravel()) + sum((outside[1:, :-1] != outside[:-1, 1:]).ravel())
     perimeter = np.pi / 8 * cell * (axis + diagonal / np.sqrt(2))
     forcing = perimeter / ((~occupied).sum() * cell**2)
     matrix = sparse.dok_matrix((occupied.size, occupied.size))
