@@ -30,48 +30,46 @@ class GRULayer(torch.autograd.Function):
     def forward(ctx: Any, gates: Tensor, hidden: Tensor, keep: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """``gates`` (T, B, 3H) input part of (r, z, n); ``hidden`` (B, H) before the first step; ``keep`` (T, B, 1)
         is 0 where an episode starts. Returns the hidden states (T, B, H)."""
-        steps, batch, width = gates.shape[0], gates.shape[1], hidden.shape[1]
-        out = gates.new_empty(steps, batch, width)
-        before = torch.empty_like(out)
-        activations = torch.empty_like(gates)
-        candidate = torch.empty_like(out)
+        width = hidden.shape[1]
+        inner = bias.expand_as(gates).clone()
+        inner[..., : 2 * width] += gates[..., : 2 * width]
+        new = gates[..., 2 * width :]
+        candidate = torch.empty_like(new, memory_format=torch.contiguous_format)
+        before, out = torch.empty_like(candidate), torch.empty_like(candidate)
         transposed = weight.t()
-        for t in range(steps):
-            h = torch.mul(hidden, keep[t], out=before[t])
-            recurrent = torch.addmm(bias, h, transposed)
-            rz = torch.add(gates[t, :, : 2 * width], recurrent[:, : 2 * width], out=activations[t, :, : 2 * width])
+        rows = (inner, inner[..., : 2 * width], *inner.split(width, dim=2), new, keep, candidate, before, out)
+        for a, rz, r, z, m, x, k, n, h, o in zip(*(tensor.unbind() for tensor in rows), strict=True):
+            torch.mul(hidden, k, out=h)
+            a.addmm_(h, transposed)
             rz.sigmoid_()
-            candidate[t].copy_(recurrent[:, 2 * width :])
-            n = torch.addcmul(
-                gates[t, :, 2 * width :], rz[:, :width], candidate[t], out=activations[t, :, 2 * width :]
-            ).tanh_()
-            hidden = torch.lerp(n, h, rz[:, width:], out=out[t])
-        ctx.save_for_backward(before, activations, candidate, keep, weight)
+            torch.addcmul(x, r, m, out=n).tanh_()
+            hidden = torch.lerp(n, h, z, out=o)
+        ctx.save_for_backward(before, inner, candidate, keep, weight)
         return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, Tensor, Tensor]:
         """Gradients with respect to gates, initial hidden state, weight and bias."""
-        before, activations, candidate, keep, weight = ctx.saved_tensors
-        steps, _, width = before.shape
-        d_gates = torch.empty_like(activations)
-        d_recurrent = torch.empty_like(activations)
+        before, inner, candidate, keep, weight = ctx.saved_tensors
+        steps, batch, width = before.shape
+        r, z, m = inner.split(width, dim=2)
+        # derivatives of a hidden state by its (r, z, recurrent n, n): all steps at once, the loop only chains them
+        slope = before.new_empty(steps, batch, 4, width)
+        by_r, by_z, by_m, by_n = slope.unbind(2)
+        torch.mul(1 - z, 1 - candidate.square(), out=by_n)
+        torch.mul(by_n, r, out=by_m)
+        torch.mul(by_m, (1 - r) * m, out=by_r)
+        torch.mul((before - candidate) * z, 1 - z, out=by_z)
+        recurrent = slope.flatten(2)[..., : 3 * width]
         carry = torch.zeros_like(before[0])
-        for t in range(steps - 1, -1, -1):
-            r, z, n = activations[t].split(width, dim=1)
-            d = carry.add_(grad[t])
-            d_z = d * (before[t] - n)
-            d_z.mul_(z).mul_(1 - z)
-            d_n = torch.addcmul(d, d, z, value=-1)
-            d_n.mul_(torch.addcmul(torch.ones_like(n), n, n, value=-1))
-            d_r = d_n * candidate[t]
-            d_r.mul_(r).mul_(1 - r)
-            torch.cat([d_r, d_z, d_n], dim=1, out=d_gates[t])
-            torch.cat([d_r, d_z, d_n * r], dim=1, out=d_recurrent[t])
-            carry = torch.addmm(d * z, d_recurrent[t], weight).mul_(keep[t])
-        flat = d_recurrent.flatten(0, 1)
-        d_weight = flat.t() @ before.flatten(0, 1)
-        return d_gates, carry, None, d_weight, flat.sum(dim=0)
+        rows = (grad, z, keep, slope, recurrent)
+        for g, u, k, s, d in zip(*(tensor.unbind()[::-1] for tensor in rows), strict=True):
+            carry = carry + g
+            s.mul_(carry.unsqueeze(1))
+            carry = carry.mul_(u).addmm_(d, weight).mul_(k)
+        flat = recurrent.flatten(0, 1)
+        d_gates = torch.cat([by_r, by_z, by_n], dim=2)
+        return d_gates, carry, None, flat.t() @ before.flatten(0, 1), flat.sum(dim=0)
 
 
 class RecurrentCore(nn.Module):
