@@ -47,13 +47,11 @@ class GaitSpec(Config):
     """Part of the step after which the swing foot is to stand."""
     swing_across: float = 0.95
     """Part of the swing after which the foot is over its foothold, -: the leg trails its target by about 60 ms."""
-    height_gain: float = 0.5
-    """Extra stance extension per metre of sag of the pelvis, -."""
-    reach_forward: tuple[float, float] = (-0.40, 0.58)
+    reach_forward: tuple[float, float] = (-0.40, 0.50)
     """Limits of a foothold ahead of the stance foot, m."""
     reach_side: tuple[float, float] = (0.14, 0.42)
     """Limits of a foothold beside the stance foot, m."""
-    edge_search: float = 0.10
+    edge_search: float = 0.14
     """How far a foothold may be moved along the heading to keep the sole off a stair's edge, m."""
     acceleration: tuple[float, float, float] = (0.8, 0.8, 1.5)
     """Fastest change of the command that the reference follows, m/s^2, m/s^2, rad/s^2."""
@@ -61,6 +59,10 @@ class GaitSpec(Config):
     """Commanded over orbit velocity in foot placement, -: makes up for what the real leg loses at touch-down."""
     pull: float = 0.6
     """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's share of balance."""
+    early: float = 0.05
+    """Time taken off the prediction of the divergent component, s: the real body diverges more slowly."""
+    climb: float = 0.20
+    """Highest climb or drop from one foothold to the next, m: one riser."""
     upright_gain: float = 2.5
     """Extra stance correction per radian of pelvis tilt, -."""
 

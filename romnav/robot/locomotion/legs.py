@@ -8,6 +8,9 @@ from torch import Tensor
 
 from romnav.robot.g1 import LEG, SIDES
 
+STRAIGHT = 0.15
+"""Knee angle of the longest leg that the inverse kinematics asks for, rad: short of the singularity."""
+
 
 def rotation(axis: int, angle: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) about coordinate axis 0, 1 or 2."""
@@ -41,7 +44,10 @@ class Legs:
             self._axes = [int(j.axis.argmax()) for j in joints]
         self._offset = torch.tensor(offset, dtype=torch.float32)[..., None]
         self._fixed = torch.stack(fixed).float()
-        self._limits = torch.tensor(limits, dtype=torch.float32)
+        self.limits = torch.tensor(limits, dtype=torch.float32)
+        straight = torch.tensor([0.0, 0.0, 0.0, STRAIGHT, 0.0, 0.0]).expand(1, 2, 6)
+        self._hip = self._offset[:, 0, :, 0]
+        self._reach = (self.forward(straight)[0] - self._hip).norm(dim=-1, keepdim=True)
 
     def forward(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ankle position (n, 2, 3), rotation (n, 2, 3, 3) and the Jacobian (n, 2, 6, 6) of (position, rotation)."""
@@ -70,9 +76,12 @@ class Legs:
             turn: (n, 2, 3, 3).
             start: (n, 2, 6) first guess; from the last control step two iterations are exact to a millimetre.
             iterations: Gauss-Newton steps.
-            damping: Levenberg weight; what cannot be reached is approached.
+            damping: Levenberg weight.
         """
         joints = start
+        # Beyond the reach of the leg Gauss-Newton swings to and fro: shorten the way to the hip first.
+        leg = position - self._hip
+        position = self._hip + leg * (self._reach / leg.norm(dim=-1, keepdim=True)).clamp(max=1.0)
         eye = damping * torch.eye(6)
         for _ in range(iterations):
             at, rot, jacobian = self.forward(joints)
@@ -81,5 +90,5 @@ class Legs:
             error = torch.cat([position - at, twist], dim=-1)
             jt = jacobian.transpose(-1, -2)
             step = torch.linalg.solve(jt @ jacobian + eye, (jt @ error[..., None]))[..., 0]
-            joints = (joints + step.clamp(-0.5, 0.5)).clamp(self._limits[..., 0], self._limits[..., 1])
+            joints = (joints + step.clamp(-0.5, 0.5)).clamp(self.limits[..., 0], self.limits[..., 1])
         return joints

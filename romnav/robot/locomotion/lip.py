@@ -165,8 +165,11 @@ class Walker:
         ahead = torch.stack([torch.cos(heading), torch.sin(heading)], dim=-1)
         return point[:, None] + offsets[..., None] * ahead[:, None]
 
-    def _clear_of_edges(self, ground: HeightMap, point: Tensor, heading: Tensor, reach: Tensor) -> Tensor:
-        """Move footholds (n, 2) along the heading to where the ground under the sole is nearest to a plane."""
+    def _clear_of_edges(
+        self, ground: HeightMap, point: Tensor, heading: Tensor, reach: Tensor, level: Tensor
+    ) -> Tensor:
+        """Move footholds (n, 2) along the heading to where the ground under the sole is nearest to a plane, not
+        more than a stair's riser from the `level` (n,) of the stance foot."""
         tries = torch.linspace(-1.0, 1.0, 15) * self.spec.edge_search
         half = FOOT_LENGTH / 2 + 0.01
         sole = torch.linspace(-half, half, 7)
@@ -174,7 +177,8 @@ class Walker:
         height = ground(at, reach[:, None]).reshape(len(point), 15, 7)
         line = height[..., :1] + (height[..., -1:] - height[..., :1]) * torch.linspace(0.0, 1.0, 7)
         bump = (height - line).abs().amax(-1)
-        best = (tries.abs() + 8.0 * (bump - 0.015).clamp(min=0.0)).argmin(1)
+        climb = ((height.amax(-1) - level[:, None]).abs() - self.spec.climb).clamp(min=0.0)
+        best = (tries.abs() + 8.0 * (bump - 0.015).clamp(min=0.0) + 20.0 * climb).argmin(1)
         return self._along(point, heading, tries[best][:, None])[:, 0]
 
     def update(
@@ -220,7 +224,7 @@ class Walker:
         self.lift = torch.where(start[:, None], swinging, self.lift)
 
         # Foothold: the divergent component at touch-down, less the periodic gait's offset, within reach.
-        left = (1.0 - phase) * self.duration
+        left = (1.0 - phase) * self.duration - s.early
         x = robots.com[:, :2] - p[:, :2]
         xi = (x + robots.com_velocity[:, :2] / self.w) * torch.exp(self.w * left)[:, None]
         landing = self.heading + turn * left
@@ -228,7 +232,7 @@ class Walker:
         ahead = step[:, 0].clamp(*s.reach_forward)
         beside = (-side * step[:, 1]).clamp(*s.reach_side)
         aim = p[:, :2] + turn_xy(torch.stack([ahead, -side * beside], dim=-1), landing)
-        aim = self._clear_of_edges(ground, aim, landing, reach)
+        aim = self._clear_of_edges(ground, aim, landing, reach, under[rows, stance])
         # Late corrections would drag the foot over an edge, early ones are noise amplified by exp(w t).
         blend = torch.where(start, 1.0, 0.4)[:, None]
         horizontal = self.foothold[:, :2] + blend * (aim - self.foothold[:, :2])
@@ -291,8 +295,7 @@ class Walker:
         turn[rows, stance], turn[rows, swing] = wanted, body
         forward = robots.velocity[:, :2] * self.dt
         pelvis = torch.cat([robots.pelvis[:, :2] + forward, robots.pelvis[:, 2:]], dim=1)[:, None].repeat(1, 2, 1)
-        sag = (height - robots.pelvis[:, 2]).clamp(-0.08, 0.08)
-        pelvis[rows, stance, 2] = height + self.spec.height_gain * sag
+        pelvis[rows, stance, 2] = height
         pelvis[rows, stance, :2] += pull
         ankle = feet - feet_turn @ torch.tensor(SOLE)
         inverse = turn.transpose(-1, -2)

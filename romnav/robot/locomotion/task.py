@@ -113,9 +113,11 @@ class Controller:
         """State of robots `ids` and of their gait, before `refer`: what `restore` needs to go on walking."""
         batch, index = self.robots.batch, ids.numpy()
         state = {name: torch.from_numpy(getattr(batch, name)[index]) for name in ("qpos", "qvel")}
-        return state | {name: getattr(self.walker, name)[ids].clone() for name in Walker.STATE} | {
-            "action": self.action[ids].clone()
-        }
+        return (
+            state
+            | {name: getattr(self.walker, name)[ids].clone() for name in Walker.STATE}
+            | {"action": self.action[ids].clone()}
+        )
 
     def restore(self, ids: Tensor, state: dict[str, Tensor]) -> None:
         """Put robots `ids` into a `snapshot`."""
