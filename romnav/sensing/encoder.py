@@ -50,7 +50,7 @@ class Encoder(nn.Module):
         before = self.channels
         for k, (width, stride) in enumerate(zip(spec.widths, spec.strides, strict=True)):
             kernel, padding = (stride, 0) if k == 0 else (3, 1)
-            layers += [nn.Conv2d(before, width, kernel, stride, padding), nn.ReLU()]
+            layers += [nn.Conv2d(before, width, kernel, stride, padding), nn.LeakyReLU(0.1)]
             before = width
         self.trunk = nn.Sequential(*layers)
         self.mean = nn.Conv2d(before, spec.latent, 1)
@@ -124,10 +124,10 @@ class Decoder(nn.Module):
         spec = encoder.spec
         self._outputs = (1, 3 * spec.cartesian, 1, len(Label))
         before = spec.widths[-1]
-        layers: list[nn.Module] = [nn.Conv2d(spec.latent, before, 3, 1, 1), nn.ReLU()]
+        layers: list[nn.Module] = [nn.Conv2d(spec.latent, before, 3, 1, 1), nn.ELU()]
         for width, stride in zip(spec.widths[-2::-1], spec.strides[:0:-1], strict=True):
-            layers += [nn.ConvTranspose2d(before, width, stride, stride), nn.ReLU()]
-            layers += [nn.Conv2d(width, width, 3, 1, 1), nn.ReLU()]
+            layers += [nn.ConvTranspose2d(before, width, stride, stride), nn.ELU()]
+            layers += [nn.Conv2d(width, width, 3, 1, 1), nn.ELU()]
             before = width
         self.trunk = nn.Sequential(*layers)
         self.heads = nn.ConvTranspose2d(before, sum(self._outputs), spec.strides[0], spec.strides[0])

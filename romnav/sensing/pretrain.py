@@ -6,7 +6,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from romnav import files, random
 from romnav.errors import RomnavError
+from romnav.progress import Progress
 from romnav.sensing import encoder as checkpoints
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
@@ -29,9 +30,9 @@ from romnav.world.solids import Label
 from romnav.world.tile import Tile
 
 NEAR = 2.0
-"""Nodes this near to a stair or ramp count as oversampled poses, m (A: both mouths and the approach to them)."""
-SHARDS = 4
-"""Parts of a batch, on one thread each, whose gradients are summed in order: no thread count changes a bit."""
+"""Nodes this near to a stair or ramp are oversampled, m (A: both mouths and the approach to them)."""
+SHARDS = 2
+"""Parts of a batch, each on one thread; their gradients are summed in order: no thread count changes a bit."""
 LOG_INTERVAL = 25
 """Gradient steps between two rows of the curve."""
 CHECKPOINT_INTERVAL = 500
@@ -39,7 +40,6 @@ CHECKPOINT_INTERVAL = 500
 DEAD_VARIANCE = 0.01
 """A latent dimension whose posterior mean varies less over images is dead (Burda et al. 2016)."""
 TERMS = ("range", "xyz", "valid", "classes", "divergence")
-Progress = Callable[[int, int, str], None]
 
 
 class Sensor(Protocol):
@@ -51,7 +51,7 @@ class Sensor(Protocol):
 
 
 class Poses:
-    """Random poses of a sensor, half anywhere, half on or near stairs and ramps; a pure function of their index.
+    """Random poses of a sensor, half anywhere, half on or near stairs and ramps; a function of their index.
 
     Args:
         grids: Grids of each tile.
@@ -74,9 +74,7 @@ class Poses:
         anywhere = random.integers(len(self._node), self._seed, index, 4)
         near = self._near[random.integers(len(self._near), self._seed, index, 5)]
         node = torch.where(index % 2 == 1, near, anywhere)
-        jitter = torch.stack(
-            [self._cell * (draw[0] - 0.5), self._cell * (draw[1] - 0.5), 0.1 * (draw[2] - 0.5)], 1
-        )
+        jitter = torch.stack([self._cell * (draw[0] - 0.5), self._cell * (draw[1] - 0.5), 0.1 * (draw[2] - 0.5)], 1)
         origin = self._node[node] + jitter
         origin[:, 2] += self._height
         return self._tile[node], origin, 2 * math.pi * draw[3]
@@ -104,8 +102,8 @@ def loss_terms(
 ) -> dict[str, Tensor]:
     """Terms of the negative evidence lower bound per image, nat (`TERMS`; their sum is the loss).
 
-    Squared errors of range and points where there is a return, cross-entropies of the validity everywhere and of
-    each class where there is a return; all of the clean image, given the corrupted one that was ``seen``
+    Squared errors of range and points where there is a return, cross-entropies of the validity everywhere and
+    of each class where there is a return; all of the clean image, given the corrupted one that was ``seen``
     (both (B, rows, columns)). ``labels`` (B, rows, columns) are `Label`, -1 without a return.
     """
     scale = spec.encoder.scale
@@ -123,8 +121,7 @@ def loss_terms(
     return {
         "range": precision * (valid * (out.range - target).square()).sum() / count,
         "xyz": precision * (valid * xyz).sum() / count,
-        "valid": functional.binary_cross_entropy_with_logits(out.valid.float(), valid, reduction="sum")
-        / count,
+        "valid": functional.binary_cross_entropy_with_logits(out.valid.float(), valid, reduction="sum") / count,
         "classes": (valid * classes.sum(1)).sum() / count,
         "divergence": spec.kl_weight * divergence(mean, log_variance).clamp(min=spec.free_bits).sum(),
     }
@@ -143,8 +140,8 @@ def pretrain(
 ) -> Path:
     """Train an encoder on images of ``tiles`` and write ``encoder.pt`` and ``curve.csv`` into ``out``.
 
-    Images are rendered as they are needed: each is a function of the seed and its index. A run that was killed goes
-    on from ``state.pt`` and ends with the same weights as one that was not; a finished one does nothing.
+    Images are rendered as they are needed: each is a function of the seed and its index. A run that was killed
+    goes on from ``state.pt`` and ends with the same weights as one that was not; a finished one does nothing.
 
     Args:
         spec: Network, corruption and optimisation.
@@ -241,7 +238,7 @@ class _Training:
         checkpoints.save(path, self.model, extra)
 
     def restore(self, path: Path) -> None:
-        """Go on from a state of the same spec; one of another spec, or a torn one, is left for a new run to replace."""
+        """Go on from a state of the same spec; one of another spec, or a torn one, will be replaced."""
         try:
             content = checkpoints.read(path)
         except RomnavError:
@@ -295,13 +292,13 @@ def quality(
 ) -> dict[str, Any]:
     """Errors of every head on ``tiles`` that the model was not trained on.
 
-    Poses are sampled as in training. ``corruption`` applies with no pixel dropout (the figures without a prefix), and
-    with half of the pixels lost (``dropout_50``).
+    Poses are sampled as in training. ``corruption`` applies without pixel dropout, and again with half of the
+    pixels lost (``dropout_50``).
 
     Returns:
-        ``images``, ``iou`` by class, ``depth_mae_m``, ``depth_rmse_m``, ``xyz_error_m`` (mean distance), ``valid_iou``,
-        ``dead_dims``, ``latent_dims``, ``divergence_nat``; the same errors by tile class in ``tiles``, and all of
-        it again in ``dropout_50``.
+        ``images``, ``iou`` by class, ``depth_mae_m``, ``depth_rmse_m``, ``xyz_error_m`` (mean distance),
+        ``valid_iou``, ``dead_dims``, ``latent_dims``, ``divergence_nat``; the errors by tile class in ``tiles``,
+        and all of it in ``dropout_50``.
     """
     poses = Poses([grids for _, grids in tiles], height, seed, device)
     kinds = np.array([tile.kind.value for tile, _ in tiles])
@@ -319,9 +316,7 @@ def quality(
             of_tile = kinds[tile.cpu().numpy()]
             for kind, errors in sums.items():
                 which = torch.tensor(of_tile == kind, device=device)
-                errors.add(
-                    model, clean[which], labels[which], checkpoints.Reconstruction(*(x[which] for x in out))
-                )
+                errors.add(model, clean[which], labels[which], checkpoints.Reconstruction(*(x[which] for x in out)))
         spread = torch.cat(means).var(0)
         part = {
             **sum(sums.values(), _Errors()).summary(),
@@ -338,7 +333,7 @@ class _Errors:
     """Sums from which the errors of a set of images follow."""
 
     def __init__(self) -> None:
-        self.geometry = torch.zeros(5, dtype=torch.float64)
+        self.geometry = torch.zeros(4, dtype=torch.float64)
         self.overlap = torch.zeros(2, len(Label) + 1, dtype=torch.int64)
 
     def __add__(self, other: _Errors) -> _Errors:
@@ -353,7 +348,7 @@ class _Errors:
         points = model.encoder.directions.permute(2, 0, 1) * clean[:, None]
         xyz = (out.xyz * scale - points[:, : out.xyz.shape[1]]).norm(dim=1)[valid].double()
         sums = [error.abs().sum(), error.square().sum(), xyz.sum(), valid.sum()]
-        self.geometry[:4] += torch.stack([s.double() for s in sums]).cpu()
+        self.geometry += torch.stack([s.double() for s in sums]).cpu()
         guess, truth = out.classes.argmax(1)[valid], labels[valid].long()
         masks = [(guess == k, truth == k) for k in range(len(Label))] + [(out.valid > 0, valid)]
         for k, (a, b) in enumerate(masks):
@@ -361,7 +356,7 @@ class _Errors:
             self.overlap[1, k] += int((a | b).sum())
 
     def summary(self) -> dict[str, Any]:
-        absolute, squared, xyz, count, _ = (float(x) for x in self.geometry)
+        absolute, squared, xyz, count = (float(x) for x in self.geometry)
         iou = [round(float(i / u), 4) if u else None for i, u in self.overlap.T]
         return {
             "iou": {label.name.lower(): value for label, value in zip(Label, iou, strict=False)},

@@ -97,11 +97,7 @@ def test_poses_are_half_near_connectors_and_stand_on_the_surface(tiles: list[tup
     nodes = torch.tensor(grids.position)
     gap = torch.cdist(origin - torch.tensor([0.0, 0.0, HEIGHT]), nodes).min(1).values
     assert gap.max() < 0.16
-    stairs = (
-        torch.cdist(origin - torch.tensor([0.0, 0.0, HEIGHT]), nodes[torch.tensor(grids.connector)])
-        .min(1)
-        .values
-    )
+    stairs = torch.cdist(origin - torch.tensor([0.0, 0.0, HEIGHT]), nodes[torch.tensor(grids.connector)]).min(1).values
     assert stairs[1::2].max() < 2.2
     assert stairs[::2].max() > 3.0
     turned = torch.histc(yaw, 8, 0.0, 2 * torch.pi)
@@ -111,22 +107,23 @@ def test_poses_are_half_near_connectors_and_stand_on_the_surface(tiles: list[tup
 
 
 def test_overfits_a_few_images(tiles: list[tuple[Tile, Grids]], lidar: Lidar) -> None:
-    spec = SPEC.model_copy(update={"free_bits": 2.0})
+    spec = SPEC.model_copy(update={"kl_weight": 0.02, "sigma": 0.5})
     index = torch.arange(64)
     clean, labels = lidar.scan(*Poses([tiles[0][1]], HEIGHT, 0)(index), labels=True)
     torch.manual_seed(0)
     model = Autoencoder(spec.encoder, lidar.directions)
-    optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
-    for _ in range(250):
-        terms = loss_terms(model, spec, clean, clean, labels, torch.Generator().manual_seed(0))
+    optimizer = torch.optim.AdamW(model.parameters(), 6e-3)
+    for step in range(200):
+        terms = loss_terms(model, spec, clean, clean, labels, torch.Generator().manual_seed(step))
         optimizer.zero_grad()
         sum(terms.values()).backward()
         optimizer.step()
     out = model.decoder(model.encoder.posterior(clean)[0])
     valid = clean > 0
     error = (out.range * spec.encoder.scale - clean)[valid].abs().mean()
-    assert error < 0.25
-    assert (out.classes.argmax(1) == labels)[valid].float().mean() > 0.95
+    average = clean.sum(0) / valid.sum(0).clamp(min=1)
+    assert error < 0.35 * (average - clean)[valid].abs().mean()
+    assert (out.classes.argmax(1) == labels)[valid].float().mean() > 0.9
     assert ((out.valid > 0) == valid).float().mean() > 0.97
 
 
@@ -206,13 +203,9 @@ def test_quality_of_a_known_model(tiles: list[tuple[Tile, Grids]], lidar: Lidar)
     valid = clean > 0
     assert found["depth_mae_m"] == pytest.approx(float((clean[valid] - 3).abs().mean()), abs=1e-3)
     assert found["xyz_error_m"] == pytest.approx(float(clean[valid].mean()), abs=1e-3)
-    assert found["iou"]["ground"] == pytest.approx(
-        float((labels == Label.GROUND).sum() / valid.sum()), abs=1e-3
-    )
+    assert found["iou"]["ground"] == pytest.approx(float((labels == Label.GROUND).sum() / valid.sum()), abs=1e-3)
     assert found["iou"]["stair"] == 0.0
     assert found["valid_iou"] == pytest.approx(float(valid.float().mean()), abs=1e-3)
     cells = model.encoder.map_shape[0] * model.encoder.map_shape[1]
     assert found["dead_dims"] == cells
-    assert (
-        found["tiles"]["outdoor"]["depth_mae_m"] == found["depth_mae_m"] == found["dropout_50"]["depth_mae_m"]
-    )
+    assert found["tiles"]["outdoor"]["depth_mae_m"] == found["depth_mae_m"] == found["dropout_50"]["depth_mae_m"]
