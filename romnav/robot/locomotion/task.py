@@ -457,7 +457,7 @@ class LocomotionEnv(VecEnv):
         )
         return {
             "robots": self.robots.state_dict(), "control": self.control.state_dict(),
-            "reference": self.control.reference, "random": self.random.get_state(),
+            "random": self.random.get_state(),
             "last": {k: v.clone() for k, v in self._last.items()},
         } | {name: getattr(self, name).clone() for name in names}  # fmt: skip
 

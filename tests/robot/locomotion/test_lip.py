@@ -42,7 +42,9 @@ def test_reference_is_periodic_and_covers_the_command(command: tuple[float, floa
 
 
 @given(velocities, sides)
-def test_capture_offset_is_the_orbit_s_divergent_component_at_touch_down(command: tuple[float, float], side: float) -> None:
+def test_capture_offset_is_the_orbit_s_divergent_component_at_touch_down(
+    command: tuple[float, float], side: float
+) -> None:
     position, velocity = at(command, side, 0.0)
     offset = capture_offset(torch.tensor([command]), torch.tensor([side]), T, WIDTH, W)
     assert offset.numpy() == pytest.approx((position + velocity / W).numpy(), abs=1e-5)

@@ -15,7 +15,9 @@ from romnav.robot.spec import RobotSpec
 @pytest.fixture(scope="module")
 def ground() -> Ground:
     rng = np.random.default_rng(0)
-    return Ground([flat(), rough(0, 0.05, rng), ramp(0, 12.0, 3.0), stairs(0, 0.15, 0.31, 0.27, 6), uturn(0, 0.1, 0.3, 5)])
+    return Ground(
+        [flat(), rough(0, 0.05, rng), ramp(0, 12.0, 3.0), stairs(0, 0.15, 0.31, 0.27, 6), uturn(0, 0.1, 0.3, 5)]
+    )
 
 
 def test_height_map_is_what_rays_hit(ground: Ground) -> None:
@@ -27,7 +29,10 @@ def test_height_map_is_what_rays_hit(ground: Ground) -> None:
     groups = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
     hit = np.zeros(1, dtype=np.int32)
     truth = np.array(
-        [5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), np.array([0, 0, -1.0]), groups, 1, -1, hit) for p in points]
+        [
+            5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), np.array([0, 0, -1.0]), groups, 1, -1, hit)
+            for p in points
+        ]
     )
     error = np.abs(ground.map(torch.tensor(points, dtype=torch.float32), torch.full((3000,), 9.0)).numpy() - truth)
     # A cell is 2 cm: only points in the cells of an edge may differ by more than the slope of a ramp.

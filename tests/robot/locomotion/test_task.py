@@ -1,0 +1,188 @@
+"""The task: mirror symmetry, rewards, curriculum, and a run that is killed and resumed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from romnav.errors import RomnavError
+from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
+from romnav.robot.locomotion.lip import turn_xy
+from romnav.robot.locomotion.task import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR, LocomotionEnv, augment
+from romnav.robot.locomotion.terrain import curriculum, flat, stairs
+from romnav.robot.locomotion.train import load_policy, train
+from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+
+SHARES = {"flat": 0.5, "stairs": 0.5}
+SPEC = LocomotionSpec(
+    task=TaskSpec(robots=8, shares=SHARES), ppo=PpoSpec(steps=6, epochs=2, minibatches=2, hidden=(16,)), iterations=2
+)
+
+
+def lanes() -> list:
+    return [flat(), stairs(0, 0.05, 0.3, 0.3, 3), stairs(1, 0.10, 0.3, 0.3, 3)]
+
+
+@pytest.mark.parametrize("table", [MIRROR, ACTION_MIRROR, PRIVILEGED_MIRROR])
+def test_mirroring_twice_changes_nothing(table: tuple[torch.Tensor, torch.Tensor]) -> None:
+    index, sign = table
+    x = torch.randn(3, len(index))
+    torch.testing.assert_close((x[:, index] * sign)[:, index] * sign, x)
+
+
+def test_the_mirrored_robot_sees_and_does_the_mirror_image() -> None:
+    """Two robots on the flat, one the other's mirror image in every state and action, stay so."""
+    spec = SPEC.model_copy(update={"task": SPEC.task.model_copy(update={"robots": 2, "shares": {"flat": 1.0}})})
+    env = LocomotionEnv(spec, [flat()], threads=1)
+    control, ids = env.control, torch.arange(2)
+    command = torch.tensor([[0.4, 0.1, 0.3], [0.4, -0.1, -0.3]])
+    start = torch.tensor([[-60.0, 1.0, 0.0], [-60.0, -1.0, 0.0]])
+    env.robots.randomize(torch.full((2,), 0.8), torch.zeros(2))
+    control.stand(ids, start, torch.tensor([0.2, -0.2]), torch.tensor([0, spec.gait.step_ticks]), command)
+    generator = torch.Generator().manual_seed(0)
+    for k in range(12):
+        control.refer(command, env.ground.map, torch.full((2,), k == 0))
+        seen = control.observe(command, env.ground.map)
+        torch.testing.assert_close(seen[1:, MIRROR[0]] * MIRROR[1], seen[:1], atol=2e-2, rtol=0)
+        action = 0.3 * torch.randn(1, 15, generator=generator)
+        control.act(torch.cat([action, action[:, ACTION_MIRROR[0]] * ACTION_MIRROR[1]]))
+    assert (env.robots.pelvis[0] * torch.tensor([1, -1, 1]) - env.robots.pelvis[1]).abs().max() < 2e-3
+
+
+def test_augmentation_appends_the_mirror_image() -> None:
+    env = LocomotionEnv(SPEC, lanes(), threads=1)
+    obs = env.get_observations()
+    actions = torch.randn(8, 15)
+    more, mirrored = augment(env, obs, actions)
+    assert len(more) == len(mirrored) == 16
+    torch.testing.assert_close(more["policy"][:8], obs["policy"])
+    again, _ = augment(env, more[8:], None)
+    torch.testing.assert_close(again["privileged"][8:], obs["privileged"])
+
+
+def test_spinning_on_the_spot_earns_less_than_walking() -> None:
+    env = LocomotionEnv(SPEC, lanes(), threads=1)
+    env.command[:] = torch.tensor([0.6, 0.0, 0.0])
+    env.average[:] = torch.tensor([0.6, 0.0, 0.0])
+    walking = env.rewards()
+    env.average[:] = torch.tensor([0.6, 0.0, 3.0])
+    spinning = env.rewards()
+    env.average[:] = 0.0
+    standing = env.rewards()
+    total = [sum(r[k] for k in ("velocity", "velocity_linear", "yaw")).mean() for r in (walking, spinning, standing)]
+    assert total[0] > total[2] + 0.5
+    assert total[0] > total[1] + 1.5
+    assert total[2] < 0.5
+    env.average[:] = torch.tensor([0.1, 0.0, 0.0])
+    assert (env.rewards()["velocity_linear"] > standing["velocity_linear"]).all(), "no gradient out of standing"
+
+
+def test_levels_follow_the_distance_along_the_path() -> None:
+    env = LocomotionEnv(SPEC, lanes(), threads=1)
+    stair = env.kind == env.kinds.index("stairs")
+    ids = stair.nonzero()[:, 0]
+    env.start[ids], env.arc[ids], env.speed[ids] = 0.8, 3.8, 0.5
+    env.episode_length_buf[ids] = 300
+    env._promote(ids, torch.zeros(8, dtype=torch.bool), stair)
+    assert (env.level[ids] == 1).all()
+    env.level[ids] = 0
+    env.episode_length_buf[ids] = 900
+    env._promote(ids, torch.zeros(8, dtype=torch.bool), stair)
+    assert (env.level[ids] == 0).all(), "arriving late does not count"
+    env.level[ids] = 1
+    for _ in range(20):
+        env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
+    assert (env.level[ids] == 0).all()
+
+
+def test_a_robot_that_starts_again_leaves_the_others_alone() -> None:
+    a, b = (LocomotionEnv(SPEC, lanes(), threads=1) for _ in range(2))
+    b.robots.set_state(torch.tensor([3]), torch.tensor([[0.0, 0, 0.2, 0, 1, 0, 0] + [0.0] * 15]), torch.zeros(1, 21))
+    for env in (a, b):
+        env.step(torch.zeros(8, 15))
+    others = [0, 1, 2, 4, 5, 6, 7]
+    torch.testing.assert_close(a.robots.pelvis[others], b.robots.pelvis[others], atol=0, rtol=0)
+    assert (a.robots.pelvis[3] - b.robots.pelvis[3]).abs().max() > 1e-3
+
+
+def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
+    whole = train(SPEC, tmp_path / "whole", threads=1)
+    train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
+    parts = train(SPEC, tmp_path / "parts", threads=2)
+    a, b = (torch.load(path, weights_only=False) for path in (whole, parts))
+    assert a["iteration"] == b["iteration"] == 2
+    for key, value in a["ppo"]["actor_state_dict"].items():
+        assert torch.equal(value, b["ppo"]["actor_state_dict"][key]), key
+    assert np.array_equal(a["env"]["robots"]["qpos"], b["env"]["robots"]["qpos"])
+    assert len((tmp_path / "parts" / "curve.csv").read_text().splitlines()) == 3
+    spec, policy, iteration = load_policy(parts)
+    assert spec == SPEC
+    assert iteration == 2
+    assert policy(torch.zeros(3, len(MIRROR[0]))).shape == (3, 15)
+    with pytest.raises(RomnavError, match="another specification"):
+        train(SPEC.model_copy(update={"seed": 9}), tmp_path / "parts", threads=1)
+    with pytest.raises(RomnavError, match="no locomotion policy"):
+        load_policy(tmp_path / "none.pt")
+
+
+class _Glide:
+    """A body that follows a command exactly, or not at all."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.pelvis, self.yaw = torch.zeros(count, 3), torch.zeros(count)
+
+    @property
+    def orientation(self) -> torch.Tensor:
+        c, s, o, i = torch.cos(self.yaw), torch.sin(self.yaw), torch.zeros_like(self.yaw), torch.ones_like(self.yaw)
+        return torch.stack([c, -s, o, s, c, o, o, o, i], dim=1).view(-1, 3, 3)
+
+    def move(self, velocity: torch.Tensor, dt: float) -> None:
+        mid = self.yaw + velocity[:, 2] * dt / 2
+        self.pelvis[:, :2] += turn_xy(velocity[:, :2], mid) * dt
+        self.yaw = self.yaw + velocity[:, 2] * dt
+
+
+def test_cycles_measure_net_motion() -> None:
+    """A body that obeys covers all of its command; one that spins or stands covers none of its way."""
+    command = torch.tensor([[0.8, 0.2, 1.0], [0.8, 0.0, 0.0], [0.8, 0.0, 0.0]])
+    does = torch.tensor([[0.8, 0.2, 1.0], [0.8, 0.0, 7.85], [0.0, 0.0, 0.0]])
+    body = _Glide(3)
+    cycles = Cycles(body, 40, 0.02)
+    for _ in range(400):
+        body.move(does, 0.02)
+        cycles.add(command, torch.ones(3, dtype=torch.bool))
+    share = cycles.covered / cycles.wanted.clamp(min=1e-6)
+    assert share[0].numpy() == pytest.approx([1.0, 1.0], abs=0.04)
+    assert share[1, 0].abs() < 0.1
+    assert share[2, 0] == 0.0
+    error = cycles.error / cycles.count
+    assert error[0] < 0.05
+    assert error[1] > 0.7
+    assert error[2] == pytest.approx(0.8, abs=1e-4)
+
+
+def test_nothing_is_crossed_by_a_robot_that_cannot_walk() -> None:
+    """Limp residuals against the gait: every trial falls or stays, none arrives."""
+    row = Row("stairs-low", "-", 0.95, (stairs(0, 0.1, 0.3, 0.3, 3),), ((0, 1), (1, 2)), (0.4, 0.8))
+    limp = torch.tensor([4.0, 0, 0, 4.0, 4.0, 0] * 2 + [0.0] * 3)
+    result = run_row(row, SPEC, lambda obs: limp.expand(len(obs), -1), 4, 0, threads=1)
+    assert result["crossed"] == 0.0
+    assert result["fell"] == 1.0
+
+
+def test_the_test_terrain_is_not_the_training_terrain() -> None:
+    def shapes(all_lanes: list) -> set:
+        return {
+            (round(abs(s.z1 - s.z0), 3), round(s.x1 - s.x0, 3), round(min(lane.slabs[0].z0, lane.slabs[0].z1), 3))
+            for lane in all_lanes
+            for s in lane.slabs[:1]
+            if lane.kind != "rough"
+        }
+
+    assert not shapes(curriculum(np.random.default_rng(1))) & shapes([lane for row in rows() for lane in row.lanes])
+    assert {row.terrain for row in rows()} == {"flat", "ramp", "stairs-low", "stairs-high", "u-stair"}
+    assert all(len(lane.slabs) >= 39 for row in rows() if row.terrain.startswith("stairs") for lane in row.lanes)
