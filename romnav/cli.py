@@ -108,12 +108,19 @@ def ablation(
     resume: ResumeOption = True,
 ) -> None:
     """Train and evaluate every arm of an ablation, then write and print its tables."""
-    from romnav.experiment.run import EVERYTHING
+    from romnav.experiment.launch import train_side_by_side
+    from romnav.experiment.run import EVERYTHING, pending
 
     plan = _plan(ctx, scale)
     seeds = plan.project.experiment(name).seeds if seed is None else (seed,)
     tables = plan.tables(name, seeds)
-    _execute(plan, [tables], device, resume, EVERYTHING)
+    stages = pending([tables], () if resume else EVERYTHING)
+    if device == "cpu":
+        policies = [stage for stage in stages if stage.kind == "policy"]
+        _perform(plan, [stage for stage in stages if stage.kind == "encoder"], device, resume)
+        train_side_by_side(plan, policies, resume)
+        stages = [stage for stage in stages if stage.kind in ("episodes", "tables")]
+    _perform(plan, stages, device, resume)
     _print_tables(tables)
 
 
@@ -279,20 +286,18 @@ def _plan(ctx: typer.Context, scale: str) -> Plan:
 def _execute(plan: Plan, targets: list[Stage], device: str, resume: bool, kinds: Collection[str]) -> None:
     """Runs what the targets need; without ``resume``, stages of the given ``kinds`` start over."""
     from romnav.experiment.run import pending
-    from romnav.experiment.stages import require_device
 
     stages = pending(targets, () if resume else kinds)
-    if stages:
-        require_device(device)
-        _perform(plan, stages, device, resume)
-    else:
+    _perform(plan, stages, device, resume)
+    if not stages:
         typer.echo("nothing to do: everything is finished and up to date", err=True)
 
 
 def _perform(plan: Plan, stages: list[Stage], device: str, resume: bool) -> None:
     from romnav.experiment.run import execute
-    from romnav.experiment.stages import Stages
+    from romnav.experiment.stages import Stages, require_device
 
+    require_device(device)
     execute(stages, Stages(plan, device, resume).actions, resume, lambda line: typer.echo(line, err=True))
 
 
@@ -333,3 +338,7 @@ def _print_table(console: Console, table: Table, rows: list[dict[str, Any]], col
         table.add_row(*("–" if v is None else f"{v:.3g}" if isinstance(v, float) else str(v) for v in values))
     if rows:
         console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 Progress = Callable[[int, int, str], None]
@@ -82,3 +82,19 @@ def _plain(title: str, meter: Meter) -> Progress:
             print(f"{title}  {line}", file=sys.stderr, flush=True)
 
     return report
+
+
+@contextmanager
+def lines(names: Sequence[str]) -> Iterator[Callable[[str, str], None]]:
+    """Shows the latest line of each of several concurrent stages on standard error: (name, line)."""
+    if not sys.stderr.isatty():
+        yield lambda name, line: print(line, file=sys.stderr, flush=True)
+        return
+    from rich.console import Console
+    from rich.progress import Progress as Bars
+    from rich.progress import SpinnerColumn, TextColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False)
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        tasks = {name: bars.add_task(name, total=None) for name in names}
+        yield lambda name, line: bars.update(tasks[name], description=line)

@@ -20,6 +20,7 @@ from romnav.navigation.perception import LidarPerception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.rom import ReducedOrderModel
+from romnav.threads import torch_threads
 from romnav.world.geodesic import GeodesicLookup
 from romnav.world.world import World
 
@@ -139,6 +140,13 @@ def evaluate(
         One array (n,) per column of the episode rows that a rollout measures: success_time, outcome, time,
         path_length (planar, sampled once per period), final_distance (geodesic), collisions.
     """
+    with torch_threads(spec.threads):
+        return _evaluate(driver, world, episodes, env, spec, progress)
+
+
+def _evaluate(
+    driver: Driver, world: World, episodes: EpisodeSet, env: EnvSpec, spec: EvaluationSpec, progress: Progress | None
+) -> dict[str, NDArray]:
     view = View(world, episodes, env)
     count = len(episodes)
     device = view.goal.device

@@ -28,3 +28,5 @@ class EvaluationSpec(Config):
     """Longest episode, s (P); success within 45 s is read off the same episode."""
     reach: float = 0.5
     """Distance to the goal that is success, in 3D, m (P)."""
+    threads: int = 1
+    """PyTorch threads (A: another number gives other bits)."""

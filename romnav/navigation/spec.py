@@ -123,6 +123,9 @@ class PPOSpec(Config):
     """Target of the adaptive learning rate (A)."""
     max_grad_norm: float = 1.0
     """Gradient clip (A)."""
+    threads: int = 1
+    """PyTorch threads of the run (A: another number gives other bits; two runs on a thread each do half as much again
+    as one run on two)."""
 
 
 class NavigationSpec(Config):

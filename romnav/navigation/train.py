@@ -20,6 +20,7 @@ from romnav.navigation.perception import LidarPerception
 from romnav.navigation.ppo import make_ppo
 from romnav.navigation.spec import NavigationSpec
 from romnav.robot.rom import ReducedOrderModel
+from romnav.threads import torch_threads
 from romnav.world.world import World
 
 SAVE_EVERY = 120.0
@@ -47,6 +48,20 @@ def train(
     Raises:
         RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written.
     """
+    with torch_threads(spec.ppo.threads):
+        return _train(spec, world, perception, out, seed, device, resume, progress)
+
+
+def _train(
+    spec: NavigationSpec,
+    world: World,
+    perception: LidarPerception,
+    out: Path,
+    seed: int,
+    device: str,
+    resume: bool,
+    progress: Progress | None,
+) -> Path:
     torch.manual_seed(seed)
     world = world.to(device)
     dynamics = ReducedOrderModel(world, spec.env.envs, spec.env.period)

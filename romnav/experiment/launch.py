@@ -1,0 +1,68 @@
+"""Runs independent stages side by side, each in a process of its own on its share of this machine's cores."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from romnav.errors import RomnavError
+from romnav.experiment.plan import Plan, Stage
+from romnav.progress import lines
+
+
+def train_side_by_side(plan: Plan, policies: Sequence[Stage], resume: bool) -> None:
+    """Train the policies of a plan, as many at a time as there are cores: a thread each does more than sharing them.
+
+    Raises:
+        RomnavError: One of them failed.
+    """
+    options = ["--scale", plan.scale.name, *([] if resume else ["--no-resume"])]
+    commands = {
+        stage.name: ["train", "policy", str(stage.arm), "--seed", str(stage.seed), *options] for stage in policies
+    }
+    if commands:
+        side_by_side(commands, plan.project.results, os.cpu_count() or 1)
+
+
+def side_by_side(commands: Mapping[str, Sequence[str]], results: Path, workers: int) -> None:
+    """Run ``romnav`` command lines by the name of their stage, at most ``workers`` at a time.
+
+    Their progress shows as one line each. When one fails, the others are stopped; what they have done is kept.
+
+    Raises:
+        RomnavError: With the message of the first command that failed.
+    """
+    running: list[subprocess.Popen[str]] = []
+    stop = threading.Event()
+
+    def run(name: str, arguments: Sequence[str]) -> None:
+        if stop.is_set():
+            return
+        command = [sys.executable, "-m", "romnav.cli", "--results", str(results), *arguments]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
+            running.append(process)
+            last = ""
+            assert process.stderr is not None
+            for line in process.stderr:
+                last = line.strip() or last
+                show(name, last)
+        if process.returncode and not stop.is_set():
+            stop.set()
+            raise RomnavError(last.removeprefix("error: ") or f"{name}: ended with status {process.returncode}")
+
+    with lines(list(commands)) as show, ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(run, name, arguments) for name, arguments in commands.items()]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            stop.set()
+            for process in running:
+                process.terminate()
+            raise
