@@ -66,14 +66,14 @@ class Encoder(nn.Module):
         """(tokens, channels) of `tokens`."""
         return math.prod(self.map_shape), self.spec.latent
 
-    def image(self, ranges: Tensor) -> Tensor:
+    def image(self, ranges: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """(B, channels, padded rows, padded columns) input for ``ranges`` (B, rows, columns) in m."""
         rows, columns = self.image_shape
-        image = ranges.new_zeros(len(ranges), self.channels, *self._padded)
+        image = ranges.new_zeros(len(ranges), self.channels, *self._padded, dtype=dtype)
         inner = image[:, :, :rows, :columns]
-        torch.mul(ranges, 1.0 / self.spec.scale, out=inner[:, 0])
+        inner[:, 0] = ranges * (1.0 / self.spec.scale)
         if self.spec.cartesian:
-            torch.mul(inner[:, :1], self.directions.permute(2, 0, 1), out=inner[:, 1:4])
+            torch.mul(inner[:, :1], self.directions.permute(2, 0, 1).to(dtype), out=inner[:, 1:4])
         inner[:, -1] = ranges > 0
         return image
 
@@ -84,13 +84,17 @@ class Encoder(nn.Module):
 
     def forward(self, ranges: Tensor) -> Tensor:
         """(B, tokens, channels) posterior means of ``ranges`` (B, rows, columns) in m, with gradients."""
-        return self.mean(self.trunk(self.image(ranges))).flatten(2).transpose(1, 2)
+        return self._tokens(self.image(ranges))
+
+    def _tokens(self, image: Tensor) -> Tensor:
+        return self.mean(self.trunk(image)).flatten(2).transpose(1, 2)
 
     @torch.no_grad()
     def tokens(self, ranges: Tensor) -> Tensor:
-        """The same in inference mode, as float32, computed in bfloat16 if the spec says so."""
+        """The same without gradients, computed in bfloat16 if the spec says so; float32."""
+        image = self.image(ranges, torch.bfloat16 if self.spec.bfloat16 else torch.float32)
         with torch.autocast(ranges.device.type, torch.bfloat16, enabled=self.spec.bfloat16):
-            return self(ranges).float()
+            return self._tokens(image).float()
 
     def digest(self) -> str:
         """Fingerprint of architecture and weights, by which a policy names its encoder."""

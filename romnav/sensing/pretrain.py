@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import io
 import math
+import operator
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -305,7 +307,7 @@ def quality(
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
         corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)
-        sums, means, nats = {kind: _Errors() for kind in sorted(set(kinds))}, [], []
+        sums, means, nats = {kind: _Errors(model.encoder.spec.cartesian) for kind in sorted(set(kinds))}, [], []
         for index in torch.arange(images, device=device).split(256):
             tile, origin, yaw = poses(index)
             clean, labels = sensor.scan(tile, origin, yaw, labels=True)
@@ -319,7 +321,7 @@ def quality(
                 errors.add(model, clean[which], labels[which], checkpoints.Reconstruction(*(x[which] for x in out)))
         spread = torch.cat(means).var(0)
         part = {
-            **sum(sums.values(), _Errors()).summary(),
+            **functools.reduce(operator.add, sums.values()).summary(),
             "dead_dims": int((spread < DEAD_VARIANCE).sum()),
             "latent_dims": len(spread),
             "divergence_nat": round(float(torch.stack(nats).mean()), 2),
@@ -332,12 +334,13 @@ def quality(
 class _Errors:
     """Sums from which the errors of a set of images follow."""
 
-    def __init__(self) -> None:
+    def __init__(self, cartesian: bool) -> None:
+        self.cartesian = cartesian
         self.geometry = torch.zeros(4, dtype=torch.float64)
         self.overlap = torch.zeros(2, len(Label) + 1, dtype=torch.int64)
 
     def __add__(self, other: _Errors) -> _Errors:
-        both = _Errors()
+        both = _Errors(self.cartesian)
         both.geometry = self.geometry + other.geometry
         both.overlap = self.overlap + other.overlap
         return both
@@ -363,5 +366,5 @@ class _Errors:
             "valid_iou": iou[-1],
             "depth_mae_m": round(absolute / count, 4),
             "depth_rmse_m": round(math.sqrt(squared / count), 4),
-            "xyz_error_m": round(xyz / count, 4),
+            "xyz_error_m": round(xyz / count, 4) if self.cartesian else None,
         }
