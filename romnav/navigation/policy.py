@@ -172,7 +172,7 @@ class NavigationActor(MLPModel):
         self._hidden: Tensor | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
-        """``[h_t, visual, state]`` for one step (B, ...) or, with episode starts as ``masks``, a rollout (T, B, ...)."""
+        """``[h_t, visual, state]`` of one step (B, ...) or, with episode starts as ``masks``, a rollout (T, B, ...)."""
         single = masks is None
         lead = obs["state"].shape[:-1]
         state = self.state_embedding(obs["state"].flatten(0, -2) * self.scale)

@@ -8,7 +8,7 @@ import hashlib
 import io
 import math
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,8 +48,8 @@ class Sensor(Protocol):
     """A range sensor over the tiles to be learned from: `romnav.sensing.lidar.Lidar` is one."""
 
     directions: Tensor
-
-    def scan(self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: bool = False) -> Any: ...
+    scan: Callable[..., Any]
+    """(tile, origin, yaw, labels=...) as of the LiDAR."""
 
 
 class Poses:
