@@ -203,10 +203,11 @@ class Humanoids:
         self.ankle_rotation = _single(b.xmat[:, self._ankles]).view(-1, 2, 3, 3)
         self.anchor, self.axis = _single(b.xanchor[:, 1:]), _single(b.xaxis[:, 1:])
 
-    def step(self, target: Tensor) -> None:
-        """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms)."""
+    def step(self, target: Tensor, ids: Tensor | None = None) -> None:
+        """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms); all, or only `ids`."""
         self.batch.ctrl[:] = target.numpy()
-        self.batch.step(nstep=self.spec.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        index = None if ids is None else ids.numpy()
+        self.batch.step(ids=index, nstep=self.spec.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.touch = torch.from_numpy(self.batch.sensordata[:, self._touch] > 0)
         self.torque = _single(self.batch.actuator_force)
         self._read()

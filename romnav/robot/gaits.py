@@ -158,7 +158,7 @@ def record(checkpoint: Path, *, per_slope: int = 4, threads: int = 0) -> GaitLib
             break
     states = {name: torch.stack([frame[name] for frame in frames]) for name in frames[0]}
     stance = torch.stack(soles)
-    gaits = []
+    gaits: list[Gait] = []
     for i in index[arrived].tolist():
         shape = (int(lane[i]), int(direction[i]))
         if all((g.kind, g.direction, g.slope) != _label(lanes, *shape) for g in gaits):

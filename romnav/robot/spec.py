@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import Field
+
 from romnav.config import Config
 
 
@@ -58,7 +60,7 @@ class GaitSpec(Config):
     speed_gain: float = 1.0
     """Commanded over orbit velocity in foot placement, -: makes up for what the real leg loses at touch-down."""
     pull: float = 0.6
-    """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's share of balance."""
+    """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's part."""
     early: float = 0.05
     """Time taken off the prediction of the divergent component, s: the real body diverges more slowly."""
     climb: float = 0.20
@@ -130,7 +132,7 @@ class TaskSpec(Config):
     """Longest episode, s."""
     action_scale: float = 0.3
     """Residual joint angle of one unit of action, rad."""
-    shares: dict[str, float] = {"flat": 0.25, "rough": 0.05, "ramp": 0.14, "stairs": 0.42, "uturn": 0.14}
+    shares: dict[str, float] = Field(default={"flat": 0.25, "rough": 0.05, "ramp": 0.14, "stairs": 0.42, "uturn": 0.14})
     """Share of the robots on each kind of terrain."""
     forward: tuple[float, float] = (-0.5, 1.0)
     """Commanded forward velocity on the flat, m/s (forward limit P)."""

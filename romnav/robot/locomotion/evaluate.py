@@ -47,15 +47,18 @@ class Row:
 def rows() -> list[Row]:
     """The test; none of its inclinations, risers and treads is among the training lanes."""
     both = ((0, 1), (1, 2))
-    low = tuple(stairs(0, r, a, b, 20) for r, a, b in ((0.105, 0.30, 0.28), (0.125, 0.28, 0.30), (0.145, 0.29, 0.26)))
-    high = tuple(stairs(0, r, a, b, 20) for r, a, b in ((0.162, 0.28, 0.26), (0.178, 0.26, 0.29)))
+    ramps = tuple(ramp(0, degrees, 5.0) for degrees in (5.0, 8.5, 12.0, 15.0))
+    low = ((0.105, 0.30, 0.28), (0.125, 0.28, 0.30), (0.145, 0.29, 0.26))
+    high = ((0.162, 0.28, 0.26), (0.178, 0.26, 0.29))
+    flights = [tuple(stairs(0, *shape, steps=20) for shape in shapes) for shapes in (low, high)]
+    storey = (uturn(0, STOREY / 24, 0.285, 12),)
     return [
         Row("flat", "corners of (-0.5..1, +-0.25, +-1) for 20 s", 0.99, (flat(),), (), (0.0, 0.0)),
-        Row("ramp", "0.4-1.0 m/s up and down", 0.97, tuple(ramp(0, d, 5.0) for d in (5.0, 8.5, 12.0, 15.0)), both, (0.4, 1.0)),
-        Row("stairs-low", "0.4-0.8 m/s up and down", 0.95, low, both, (0.4, 0.8)),
-        Row("stairs-high", "0.4-0.6 m/s up and down", 0.90, high, both, (0.4, 0.6)),
-        Row("u-stair", "0.4-0.6 m/s one floor up and down", 0.90, (uturn(0, STOREY / 24, 0.285, 12),), ((0, 2), (2, 0)), (0.4, 0.6)),
-    ]  # fmt: skip
+        Row("ramp", "0.4-1.0 m/s up and down", 0.97, ramps, both, (0.4, 1.0)),
+        Row("stairs-low", "0.4-0.8 m/s up and down", 0.95, flights[0], both, (0.4, 0.8)),
+        Row("stairs-high", "0.4-0.6 m/s up and down", 0.90, flights[1], both, (0.4, 0.6)),
+        Row("u-stair", "0.4-0.6 m/s one floor up and down", 0.90, storey, ((0, 2), (2, 0)), (0.4, 0.6)),
+    ]
 
 
 class Cycles:
@@ -134,7 +137,7 @@ def run_row(
             arc = ground.project(lane, xy, arc)
             command = steer(ground, lane, arc, forward, xy, heading_of(robots.orientation), speed)
         control.refer(command, ground.map, torch.full((trials,), tick == 0))
-        control.act(policy(control.observe(command, ground.map)))
+        control.act(policy(control.observe(command, ground.map)), alive.nonzero()[:, 0])
         fell |= alive & has_fallen(robots)
         if not level:
             near = (robots.pelvis[:, :2] - ground.at(lane, goal)).norm(dim=1) < 0.5

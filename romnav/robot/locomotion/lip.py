@@ -266,8 +266,8 @@ class Walker:
         )  # fmt: skip
 
     def _inverse(
-        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, planted: Tensor, foot: Tensor,
-        height: Tensor, pull: Tensor, landing: Tensor, ground: HeightMap, reach: Tensor,
+        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, planted: Tensor,
+        foot: Tensor, height: Tensor, pull: Tensor, landing: Tensor, ground: HeightMap, reach: Tensor,
     ) -> Tensor:  # fmt: skip
         """Leg joints: the swing foot placed from the pelvis as it is, the stance leg under the pelvis as wanted."""
         n = len(rows)

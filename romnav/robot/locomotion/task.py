@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -67,12 +68,12 @@ class Controller:
         self.reference = self.walker.update(self.robots, command, ground, first=first)
         return self.reference
 
-    def act(self, action: Tensor) -> None:
-        """Step all robots with residual actions (n, 15)."""
+    def act(self, action: Tensor, ids: Tensor | None = None) -> None:
+        """Step robots with residual actions (n, 15); all, or only `ids`."""
         self.action = action.clamp(-4.0, 4.0)
         target = self.spec.task.action_scale * self.action
         target[:, :12] += self.reference.joints.flatten(1) + self.reference.torque.flatten(1) / self.robots.kp[:12]
-        self.robots.step(target)
+        self.robots.step(target, ids)
 
     def observe(self, command: Tensor, ground: HeightMap) -> Tensor:
         """Observation (n, d) of the policy; `MIRROR` says how it mirrors."""
@@ -238,7 +239,7 @@ class LocomotionEnv(VecEnv):
         self._by_kind = [[i for i, lane in enumerate(lanes) if lane.kind == kind] for kind in self.kinds]
         edges = np.round(np.cumsum([0.0, *t.shares.values()]) / sum(t.shares.values()) * t.robots).astype(int)
         self.kind = torch.zeros(t.robots, dtype=torch.long)
-        for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        for k, (a, b) in enumerate(pairwise(edges)):
             self.kind[a:b] = k
         self.flat = self.kind == self.kinds.index("flat")
         self._top = torch.tensor([len(group) - 1 for group in self._by_kind])[self.kind]
@@ -410,7 +411,7 @@ class LocomotionEnv(VecEnv):
         self._refer()
 
         terms = self.rewards()
-        reward = (self.spec.reward.scale * sum(terms.values())).clamp(min=self.spec.reward.floor)
+        reward = (self.spec.reward.scale * torch.stack(list(terms.values())).sum(0)).clamp(min=self.spec.reward.floor)
         # A robot that has just been placed says nothing about the step that ended its last episode.
         self._reward = torch.where(done, self._reward, reward)
         log |= {f"/reward/{name}": term.mean().item() for name, term in terms.items()}

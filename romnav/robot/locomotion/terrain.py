@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -166,7 +166,9 @@ class Ground:
 
     def __init__(self, lanes: list[Lane], *, cell: float = 0.02) -> None:
         self.lanes = lanes
-        centre, half, quat = [], [], []
+        centre: list[Any] = []
+        half: list[Any] = []
+        quat: list[Any] = []
         offsets, y = [], 0.0
         for lane in lanes:
             low = min([s.y0 for s in lane.slabs], default=-1.2)
@@ -208,7 +210,7 @@ class Ground:
         points = max(len(lane.path) for lane in lanes)
         path = np.stack(
             [
-                np.concatenate([lane.path, np.repeat(lane.path[-1:], points - len(lane.path), axis=0)]) + [0.0, dy]
+                np.pad(lane.path, ((0, points - len(lane.path)), (0, 0)), mode="edge") + np.array([0.0, dy])
                 for lane, dy in zip(lanes, offsets, strict=True)
             ]
         )

@@ -33,8 +33,8 @@ def make_actor(spec: PpoSpec, obs: TensorDict, actions: int) -> MLPModel:
     )  # fmt: skip
     last = [m for m in actor.mlp.modules() if isinstance(m, torch.nn.Linear)][-1]
     with torch.no_grad():
-        last.weight *= 0.01
-        last.bias *= 0.0
+        last.weight.mul_(0.01)
+        last.bias.zero_()
     return actor
 
 
@@ -173,10 +173,13 @@ def train(
 def _row(rows: list[dict[str, float]]) -> dict[str, float]:
     """Counts are summed, everything else is averaged, over the steps of an iteration."""
     counts = ("/ended", "/arrived", "/fallen")
-    keys = dict.fromkeys(key for row in rows for key in row)
+    table: dict[str, list[float]] = {}
+    for row in rows:
+        for key, value in row.items():
+            table.setdefault(key, []).append(value)
     return {
-        key.removeprefix("/"): (sum if key.startswith(counts) else np.mean)([row[key] for row in rows if key in row])
-        for key in keys
+        key.removeprefix("/"): float(sum(values) if key.startswith(counts) else np.mean(values))
+        for key, values in table.items()
     }
 
 
