@@ -108,7 +108,7 @@ def ablation(
     resume: ResumeOption = True,
 ) -> None:
     """Train and evaluate every arm of an ablation, then write and print its tables."""
-    from romnav.experiment.launch import train_side_by_side
+    from romnav.experiment.launch import stages_side_by_side
     from romnav.experiment.run import EVERYTHING, pending
 
     plan = _plan(ctx, scale)
@@ -116,10 +116,10 @@ def ablation(
     tables = plan.tables(name, seeds)
     stages = pending([tables], () if resume else EVERYTHING)
     if device == "cpu":
-        policies = [stage for stage in stages if stage.kind == "policy"]
         _perform(plan, [stage for stage in stages if stage.kind == "encoder"], device, resume)
-        train_side_by_side(plan, policies, resume)
-        stages = [stage for stage in stages if stage.kind in ("episodes", "tables")]
+        for kind in ("policy", "episodes"):
+            stages_side_by_side(plan, [stage for stage in stages if stage.kind == kind], resume)
+        stages = [stage for stage in stages if stage.kind == "tables"]
     _perform(plan, stages, device, resume)
     _print_tables(tables)
 

@@ -14,17 +14,18 @@ from romnav.errors import RomnavError
 from romnav.experiment.plan import Plan, Stage
 from romnav.progress import lines
 
+COMMANDS = {"policy": ("train", "policy"), "episodes": ("eval",)}
+"""Command that makes the output of a kind of stage, given the arm."""
 
-def train_side_by_side(plan: Plan, policies: Sequence[Stage], resume: bool) -> None:
-    """Train the policies of a plan, as many at a time as there are cores: a thread each does more than sharing them.
+
+def stages_side_by_side(plan: Plan, stages: Sequence[Stage], resume: bool) -> None:
+    """Train or evaluate arms, as many at a time as there are cores: a thread each does more than sharing them.
 
     Raises:
         RomnavError: One of them failed.
     """
     options = ["--scale", plan.scale.name, *([] if resume else ["--no-resume"])]
-    commands = {
-        stage.name: ["train", "policy", str(stage.arm), "--seed", str(stage.seed), *options] for stage in policies
-    }
+    commands = {s.name: [*COMMANDS[s.kind], str(s.arm), "--seed", str(s.seed), *options] for s in stages}
     if commands:
         side_by_side(commands, plan.project.results, os.cpu_count() or 1)
 
@@ -45,7 +46,9 @@ def side_by_side(commands: Mapping[str, Sequence[str]], results: Path, workers: 
             return
         command = [sys.executable, "-m", "romnav.cli", "--results", str(results), *arguments]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        with subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment
+        ) as process:
             running.append(process)
             last = ""
             assert process.stderr is not None
