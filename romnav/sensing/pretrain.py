@@ -35,6 +35,8 @@ NEAR = 2.0
 """Nodes this near to a stair or ramp are oversampled, m (A: both mouths and the approach to them)."""
 SHARDS = 2
 """Parts of a batch, each on one thread; their gradients are summed in order: no thread count changes a bit."""
+WARM_UP = 25
+"""Gradient steps over which the learning rate rises."""
 LOG_INTERVAL = 25
 """Gradient steps between two rows of the curve."""
 CHECKPOINT_INTERVAL = 500
@@ -204,7 +206,7 @@ class _Training:
         epoch, position = divmod(self.step, self._per_epoch)
         index = torch.arange(position * spec.batch, (position + 1) * spec.batch, device=self._device)
         parts = list(pool.map(lambda k: self._gradients(index[k::SHARDS], epoch, k), range(SHARDS)))
-        rate = 0.5 * spec.learning_rate * (1.0 + math.cos(math.pi * self.step / self.steps))
+        rate = spec.learning_rate * min(1.0, (self.step + 1) / WARM_UP, 4.0 * (1.0 - self.step / self.steps))
         for group in self._optimizer.param_groups:
             group["lr"] = rate
         for i, parameter in enumerate(self._parameters):
@@ -307,7 +309,7 @@ def quality(
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
         corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)
-        sums, means, nats = {kind: _Errors(model.encoder.spec.cartesian) for kind in sorted(set(kinds))}, [], []
+        sums, means, nats = {str(kind): _Errors(model.encoder.spec.cartesian) for kind in sorted(set(kinds))}, [], []
         for index in torch.arange(images, device=device).split(256):
             tile, origin, yaw = poses(index)
             clean, labels = sensor.scan(tile, origin, yaw, labels=True)

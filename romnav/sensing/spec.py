@@ -99,10 +99,10 @@ class PretrainSpec(Config):
     """Images, half from uniform poses and half on or near stairs and ramps (P)."""
     epochs: int = Field(default=10, ge=1)
     """Passes over the images, each with new corruption (P)."""
-    batch: int = Field(default=64, ge=1)
-    """Images per gradient step (A)."""
-    learning_rate: float = 4e-3
-    """Peak of AdamW's learning rate, then a cosine to zero (A)."""
+    batch: int = Field(default=32, ge=1)
+    """Images per gradient step (A: steps, not images, limit short runs)."""
+    learning_rate: float = 8e-3
+    """AdamW's learning rate, falling to zero over the last quarter (A: half of it learns slower, twice no faster)."""
     weight_decay: float = 1e-4
     """Of AdamW (A)."""
     sigma: float = Field(default=1.0, gt=0.0)
