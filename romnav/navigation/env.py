@@ -82,6 +82,8 @@ class NavigationEnv(VecEnv):
         self._since_arrival = torch.full_like(self._env, -1)
         self._since_best = torch.zeros_like(self._env)
         self._cross = torch.zeros(count, dtype=torch.bool, device=device)
+        self._geodesic = torch.zeros(count, device=device)
+        self._direction = torch.zeros(count, 2, device=device)
         self._finished = torch.zeros(4, dtype=torch.float64, device=device)
         self._reward_sums = torch.zeros(8, dtype=torch.float64, device=device)
         self._reward_steps = 0
@@ -243,13 +245,13 @@ class NavigationEnv(VecEnv):
         d = self.dynamics
         d.reset(envs, start)
         self._goal[envs] = start.goal
+        self._geodesic[envs], self._direction[envs] = self._lookup(start.tile, start.layer, start.xy, start.goal)
         self._goal_position[envs] = self.world.position[self.world.goal[start.goal]]
         self._goal_yaw[envs] = start.goal_yaw
         self._command[envs] = 0.0
         self._since_arrival[envs] = -1
         self._since_best[envs] = 0
         self.episode_length_buf[envs] = 0
-        self._geodesic, self._direction = self._measure()
         height = (self._goal_position - d.position)[envs, 2].abs()
         self._best[envs] = torch.stack([self._geodesic[envs], height], dim=1)
         self._cross[envs] = is_cross_level(d.position[envs, 2], self._goal_position[envs, 2])

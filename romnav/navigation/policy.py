@@ -10,8 +10,8 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules import HiddenState
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.nn import functional as F
 
+from romnav.navigation.attention import Attend
 from romnav.navigation.spec import PolicySpec
 
 LAYERS = 2
@@ -121,20 +121,14 @@ class Attention(nn.Module):
 
     def forward(self, tokens: Tensor, state: Tensor) -> Tensor:
         """Tokens (B, K, C) and state embedding (B, S) -> (B, `outputs`)."""
-        batch = len(tokens)
         x = self.embed(tokens) + self.place
-        q, k, v = (self._split(part) for part in self.self_qkv(x).chunk(3, dim=2))
-        x = self.norm(x + self.self_out(self._merge(F.scaled_dot_product_attention(q, k, v))))
-        query = torch.cat([self.queries.expand(batch, -1, -1), self.state_query(state)[:, None]], dim=1)
-        k, v = (self._split(part) for part in self.cross_kv(x).chunk(2, dim=2))
-        x = query + self.cross_out(self._merge(F.scaled_dot_product_attention(self._split(query), k, v)))
-        return x.flatten(1)
+        x = self.norm(x + self.self_out(Attend.apply(self._split(self.self_qkv(x), 3), None).flatten(2)))
+        query = torch.cat([self.queries.expand(len(x), -1, -1), self.state_query(state)[:, None]], dim=1)
+        kept = Attend.apply(self._split(self.cross_kv(x), 2), self._split(query, 1).squeeze(2))
+        return (query + self.cross_out(kept.flatten(2))).flatten(1)
 
-    def _split(self, x: Tensor) -> Tensor:
-        return x.unflatten(2, (self.heads, -1)).transpose(1, 2)
-
-    def _merge(self, x: Tensor) -> Tensor:
-        return x.transpose(1, 2).flatten(2)
+    def _split(self, x: Tensor, parts: int) -> Tensor:
+        return x.unflatten(2, (parts, self.heads, -1))
 
 
 class NavigationActor(MLPModel):
