@@ -8,23 +8,18 @@ case, with a vector-valued statistic that does by hand what ours does.
 
 from __future__ import annotations
 
-import argparse
-import json
-import statistics
-import time
 from collections.abc import Callable
+from functools import partial
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import scipy.stats
+from _common import arguments, report, take_turns
 from numpy.typing import NDArray
 
-from romnav import files
 from romnav.evaluation.metrics import LEVELS, METRICS, in_level, quantities
 from romnav.evaluation.rows import HORIZONS, Arm, EpisodeRows, Provenance
 from romnav.evaluation.statistics import Bootstrap
-from romnav.experiment import store
 
 RESAMPLES = 10_000
 EPISODES = 1024
@@ -54,9 +49,7 @@ def synthetic(arm: str, skill: float) -> Arm:
 def ours(arms: list[Arm]) -> NDArray:
     """Every interval, shape (84, 2)."""
     bootstrap = Bootstrap(arms, resamples=RESAMPLES)
-    found = [
-        bootstrap.metric(arm.name, metric, level) for arm in arms for metric in SHOWN for level in LEVELS
-    ]
+    found = [bootstrap.metric(arm.name, metric, level) for arm in arms for metric in SHOWN for level in LEVELS]
     contrasts = [
         bootstrap.contrast(a.name, b.name, horizon, level)
         for a, b in combinations(arms, 2)
@@ -125,58 +118,31 @@ def scipy_once(arms: list[Arm]) -> NDArray:
     return np.stack(scipy.stats.bootstrap(ids, everything, rng=0, **options).confidence_interval, axis=-1)
 
 
-def timed(work: Callable[[list[Arm]], NDArray], arms: list[Arm], repeats: int) -> tuple[NDArray, list[float]]:
-    """Result and times, s, after one call to warm up."""
-    result, times = work(arms), []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work(arms)
-        times.append(time.perf_counter() - start)
-    return result, times
-
-
 def main() -> None:
-    """Measures, prints and writes ``results/bench/bootstrap.json``."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).parents[1] / "results/bench/bootstrap.json"
-    )
-    arguments = parser.parse_args()
+    """Measure, print and write ``results/bench/bootstrap.json``."""
+    options = arguments(__doc__, repeats=3)
     skills = {"rom": 0.9, "uniform": 0.6, "nocap": 0.55, "uniform-nocap": 0.5}
     arms = [synthetic(arm, skill) for arm, skill in skills.items()]
-    mine, times = timed(ours, arms, arguments.repeats)
-    width = (mine[:, 1] - mine[:, 0])[:, None]
-    seconds = statistics.median(times)
-    print(f"{'romnav':52} {seconds:8.3f} s  (min {min(times):.3f}, max {max(times):.3f})")
-    peers, agree = {}, True
-    for name, work in (
-        ("scipy.stats.bootstrap, one call per interval", scipy_each),
-        ("scipy.stats.bootstrap, one hand-vectorised call", scipy_once),
-    ):
-        theirs, times = timed(work, arms, max(1, arguments.repeats // 2))
-        # Quantiles of 10,000 resamples scatter by 0.7 % of the interval (one sigma) in each of 168 bounds and
-        # two programs; a proportion moves in steps of one episode.
-        off = float((np.abs(theirs - mine) / width).max())
-        agree &= off < 0.05
-        peers[name] = statistics.median(times)
-        print(
-            f"{name:52} {peers[name]:8.3f} s  (min {min(times):.3f}, max {max(times):.3f}), "
-            f"{peers[name] / seconds:.1f} x ours, bounds differ by at most {off:.1%} of an interval"
-        )
-    source = store.provenance()
-    record = {
-        "work": f"{len(mine)} intervals: {len(arms)} arms x {EPISODES} episodes x {RESAMPLES} resamples",
-        "ours": seconds,
-        "peers": peers,
-        "unit": "s",
-        "ratio_to_best_peer": min(peers.values()) / seconds,
-        "agree": agree,
-        "machine": source["machine"],
-        "commit": source["commit"],
+    programs = {
+        "romnav": ours,
+        "scipy.stats.bootstrap, one call per interval": scipy_each,
+        "scipy.stats.bootstrap, one hand-vectorised call": scipy_once,
     }
-    files.write(arguments.out, json.dumps(record, indent=2) + "\n")
-    if not agree:
+    found: dict[str, NDArray] = {}
+
+    def work(name: str) -> None:
+        found[name] = programs[name](arms)
+
+    times = take_turns({name: partial(work, name) for name in programs}, options.repeats)
+    mine = found["romnav"]
+    width = (mine[:, 1] - mine[:, 0])[:, None]
+    # Quantiles of 10,000 resamples scatter by 0.7 % of the interval (one sigma) in each of 168 bounds and
+    # two programs; a proportion moves in steps of one episode.
+    off = max(float((np.abs(theirs - mine) / width).max()) for theirs in found.values())
+    print(f"bounds differ by at most {off:.1%} of an interval")
+    text = f"{len(mine)} intervals: {len(arms)} arms x {EPISODES} episodes x {RESAMPLES} resamples"
+    report("bootstrap", text, "s", times.pop("romnav"), times, options.out, agree=off < 0.05, largest_difference=off)
+    if off >= 0.05:
         raise SystemExit("the intervals differ by more than Monte Carlo error")
 
 

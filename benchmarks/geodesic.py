@@ -9,20 +9,17 @@ scikit-fmm cannot pass between floors: it computes the goal's floor alone.
 
 from __future__ import annotations
 
-import argparse
-import json
+import statistics
 import time
 from collections.abc import Callable
 from math import gcd, hypot
-from pathlib import Path
 
 import numpy as np
+from _common import arguments, report, take_turns
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from romnav import files
-from romnav.experiment import store
 from romnav.world.geodesic import UNIT, solve
 from romnav.world.grids import OFFSETS_8, Grids
 from romnav.world.spec import WorldSpec
@@ -121,14 +118,11 @@ def marching(grids: Grids, goal: int) -> NDArray:
     return field
 
 
-def timed(work: Callable[[], list[NDArray]], repeats: int) -> tuple[list[NDArray], float]:
-    """Result and the least CPU time, s, after one call to warm up."""
-    result, times = work(), []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return result, min(times)
+def timed(work: Callable[[], list[NDArray]], repeats: int) -> tuple[list[NDArray], list[float]]:
+    """Result, and CPU times, s."""
+    results: list[list[NDArray]] = []
+    times = take_turns({"work": lambda: results.append(work())}, repeats, time.process_time)
+    return results[0], times["work"]
 
 
 def errors(theirs: list[NDArray], ours: list[NDArray]) -> NDArray:
@@ -138,38 +132,27 @@ def errors(theirs: list[NDArray], ours: list[NDArray]) -> NDArray:
 
 
 def main() -> None:
-    """Measures, prints and writes ``results/bench/geodesic.json``."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tiles", type=int, default=8)
-    parser.add_argument("--goals", type=int, default=96)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results/bench/geodesic.json")
-    arguments = parser.parse_args()
-    spec = WorldSpec(tiles=arguments.tiles, seed=7)
+    """Measure, print and write ``results/bench/geodesic.json``."""
+    options = arguments(__doc__, tiles=8, goals=96, repeats=3)
+    spec = WorldSpec(tiles=options.tiles, seed=7)
     tiles = [generate(spec, i)[1] for i in range(spec.tiles)]
     rng = np.random.default_rng(0)
-    goals = [rng.choice(len(g.position), arguments.goals, replace=False) for g in tiles]
+    goals = [rng.choice(len(g.position), options.goals, replace=False) for g in tiles]
     few = [g[:8] for g in goals]
     count = sum(map(len, goals))
 
-    solved, seconds = timed(lambda: [p.distance for p in solve(tiles, goals, workers=1)], arguments.repeats)
+    solved, ours = timed(lambda: [p.distance for p in solve(tiles, goals, workers=1)], options.repeats)
     exact = [d[:8] * UNIT for d in solved]
-    ours = 1e3 * seconds / count
     nodes = round(np.mean([len(g.position) for g in tiles]))
-    print(f"{'romnav':36} {ours:8.3f} ms a goal")
-    peers, accurate, agree = {}, {}, True
+    accurate, inaccurate, agree = {}, {}, True
 
     def compare(name: str, work: Callable[[], list[NDArray]], repeats: int) -> float:
-        theirs, spent = timed(work, repeats)
-        peers[name] = 1e3 * spent / sum(map(len, few))
+        theirs, times = timed(work, repeats)
         error = errors(theirs, exact)
         wrong = (np.abs(error) > ACCURATE).mean()
-        print(
-            f"{name:36} {peers[name]:8.3f} ms a goal, {peers[name] / ours:5.1f} x ours; "
-            f"error at most {error.max():.1%}, over {ACCURATE:.0%} at {wrong:.2%} of the nodes"
-        )
-        if wrong <= ACCURATE:
-            accurate[name] = peers[name]
+        print(f"{name:36} error at most {error.max():.1%}, over {ACCURATE:.0%} at {wrong:.2%} of the nodes")
+        group = accurate if wrong <= ACCURATE else inaccurate
+        group[name] = [1e3 * t / sum(map(len, few)) for t in times]
         return float(error.min())
 
     for with_corners in (False, True):
@@ -181,28 +164,25 @@ def main() -> None:
                     dijkstra(graph, indices=i)[:, : len(g.position)]
                     for graph, g, i in zip(graphs, tiles, few, strict=True)
                 ],
-                arguments.repeats,
+                options.repeats,
             )
             agree &= shortest > -UNIT
     compare(
         "scikit-fmm, second order, one floor",
         lambda: [np.stack([marching(g, i) for i in goal]) for g, goal in zip(tiles, few, strict=True)],
-        arguments.repeats,
+        options.repeats,
     )
-    source = store.provenance()
-    record = {
-        "work": f"{count} fields over {nodes} nodes on average, {len(tiles)} tiles of all classes; one core, CPU time",
-        "ours": ours,
-        "peers": accurate,
-        "inaccurate": {name: value for name, value in peers.items() if name not in accurate},
-        "unit": "ms/goal",
-        "ratio_to_best_peer": min(accurate.values()) / ours,
-        "agree": agree,
-        "machine": source["machine"],
-        "commit": source["commit"],
-    }
-    files.write(arguments.out, json.dumps(record, indent=2) + "\n")
-    print(f"{record['ratio_to_best_peer']:.1f} x the fastest peer below {ACCURATE:.0%}")
+    text = f"{count} fields over {nodes} nodes on average, {len(tiles)} tiles of all classes; one core, CPU time"
+    report(
+        "geodesic",
+        text,
+        "ms a goal",
+        [1e3 * t / count for t in ours],
+        accurate,
+        options.out,
+        agree=agree,
+        inaccurate={name: statistics.median(times) for name, times in inaccurate.items()},
+    )
     if not agree:
         raise SystemExit("a path is shorter than the exact one")
 

@@ -9,10 +9,10 @@ it is not installed (``pip install romnav[bench]``).
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import json
+import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -22,11 +22,10 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 import torch
+from _common import arguments, report, take_turns
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu, spsolve
 
-from romnav import files
-from romnav.experiment import store
 from romnav.safety.filter import SafetyFilter, cbf_qp, filter_velocity
 from romnav.safety.occupancy import Rasterizer
 from romnav.safety.poisson import PoissonSolver
@@ -137,41 +136,6 @@ class Osqp:
         return float(patch.mean())
 
 
-def least(works: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Shortest time of each work, s; they take turns, so that another load on the machine hits all of
-    them."""
-    times = {name: np.inf for name in works}
-    for _ in range(repeats):
-        for name, work in works.items():
-            start = time.perf_counter()
-            work()
-            times[name] = min(times[name], time.perf_counter() - start)
-    return times
-
-
-def report(name: str, work: str, times: dict[str, float], agree: bool, out: Path, **more: float) -> bool:
-    """Prints a comparison and writes ``<name>.json``."""
-    peers = {key: value for key, value in times.items() if key != "ours"}
-    ours, best = times["ours"], min(peers.values())
-    print(f"{work}\n  {'ours':40} {ours * 1e3:10.5f} ms   {more}")
-    for peer, seconds in peers.items():
-        print(f"  {peer:40} {seconds * 1e3:10.5f} ms   {seconds / ours:.1f} x ours")
-    source = store.provenance()
-    record = {
-        "work": work,
-        "ours": ours,
-        "peers": peers,
-        "unit": "s",
-        "ratio_to_best_peer": best / ours,
-        "agree": agree,
-        **more,
-        "machine": source["machine"],
-        "commit": source["commit"],
-    }
-    files.write(out / f"{name}.json", json.dumps(record, indent=2) + "\n")
-    return agree
-
-
 def peers_of_the_solve() -> dict[str, Callable[[System], NDArray]]:
     peers = {"scipy spsolve": superlu, "scipy splu, symmetric mode": superlu_symmetric}
     return peers | ({"pyamg, CG to 3e-3": amg} if importlib.util.find_spec("pyamg") else {})
@@ -193,14 +157,14 @@ def latency(repeats: int, out: Path) -> bool:
     for k in range(6):
         ours(k)
     peers = peers_of_the_solve()
-    times: dict[str, float] = {}
+    times: dict[str, list[float]] = defaultdict(list)
     off_h = off_v = 0.0
     for k in range(6, repeats + 6):
         task = system(grids[k])
         works = {"ours": lambda k=k: ours(k)}
         works |= {f"{n} + osqp": lambda p=p, t=task: qp.filter(p(t)) for n, p in peers.items()}
-        for name, seconds in least(works, 1).items():
-            times[name] = min(times.get(name, np.inf), seconds)
+        for name, seconds in take_turns(works, 1, warm_up=0).items():
+            times[name] += seconds
         exact = superlu(task)
         h, filtered = results["ours"]
         free = ~grids[k].ravel()
@@ -210,7 +174,9 @@ def latency(repeats: int, out: Path) -> bool:
         off_v = max(off_v, float((filtered.velocity - best.velocity).abs().max()))
     agree = off_h < CLOSE[0] and off_v < CLOSE[1]
     work = f"{CELLS} x {CELLS} Poisson solve and filter of a walking robot, one frame"
-    return report("poisson", work, times, agree, out, error_of_h=off_h, error_of_velocity_m_s=off_v)
+    more = {"error_of_h": off_h, "error_of_velocity_m_s": off_v}
+    report("poisson", work, "s", times.pop("ours"), times, out, agree=agree, **more)
+    return agree
 
 
 def throughput(repeats: int, out: Path, robots: int = 64, returns: int = 220 * 59) -> bool:
@@ -229,9 +195,8 @@ def throughput(repeats: int, out: Path, robots: int = 64, returns: int = 220 * 5
     first = filter_(clouds[0], desired).h.numpy()
     systems = [system(grid) for grid in Rasterizer(robots)(clouds[0]).inflated.numpy()]
     programs = [Osqp() for _ in range(robots)]
-    times, off = {"ours": np.inf}, 0.0
-    for cloud in clouds[1:]:
-        times["ours"] = min(times["ours"], least({"ours": lambda c=cloud: filter_(c, desired)}, 1)["ours"])
+    ours = [take_turns({"": lambda c=cloud: filter_(c, desired)}, 1, warm_up=0)[""][0] for cloud in clouds[1:]]
+    times, off = {}, 0.0
     with ThreadPoolExecutor(2) as pool:
         for name, peer in peers_of_the_solve().items():
 
@@ -240,12 +205,13 @@ def throughput(repeats: int, out: Path, robots: int = 64, returns: int = 220 * 5
 
             start = time.perf_counter()
             levels = list(pool.map(one, systems, programs))
-            times[f"{name} + osqp, without the points"] = time.perf_counter() - start
+            times[f"{name} + osqp, without the points"] = [time.perf_counter() - start]
             off = max(off, float(np.abs(levels - first).max() / first.max()))
     work = f"{robots} robots, {returns} points each, to safe commands on two threads"
-    real_time = 0.2 / times["ours"]
-    more = {"error_of_h": off, "times_real_time_at_5_hz": real_time}
-    return report("poisson-robots", work, times, off < CLOSE[0], out, **more)
+    more = {"error_of_h": off, "times_real_time_at_5_hz": 0.2 / statistics.median(ours)}
+    agree = off < CLOSE[0]
+    report("poisson-robots", work, "s", ours, times, out, agree=agree, **more)
+    return agree
 
 
 def programs(count: int, repeats: int, out: Path) -> bool:
@@ -264,23 +230,22 @@ def programs(count: int, repeats: int, out: Path) -> bool:
         "ours": lambda: cbf_qp(*tensors, lower, upper),
         "osqp, updated and solved one by one": lambda: [qp.solve(desired[k], normal[k], bound[k]) for k in range(some)],
     }
-    times = least(works, repeats)
-    times = {name: seconds / (count if name == "ours" else some) for name, seconds in times.items()}
+    times = take_turns(works, repeats)
+    each = {name: [t / (count if name == "ours" else some) for t in seconds] for name, seconds in times.items()}
     work = f"one CBF-QP with a velocity box, of {count} at once"
-    return report("poisson-qp", work, times, off < 1e-3, out, error_of_velocity_m_s=off)
+    agree = off < 1e-3
+    report("poisson-qp", work, "s", each.pop("ours"), each, out, agree=agree, error_of_velocity_m_s=off)
+    return agree
 
 
 def main() -> None:
-    """Measures, prints and writes ``results/bench/poisson*.json``."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results/bench")
-    arguments = parser.parse_args()
+    """Measure, print and write ``results/bench/poisson*.json``."""
+    options = arguments(__doc__, repeats=20)
     torch.set_num_threads(1)
     agree = [
-        latency(arguments.repeats, arguments.out),
-        throughput(max(2, arguments.repeats // 2), arguments.out),
-        programs(100_000, 3, arguments.out),
+        latency(options.repeats, options.out),
+        throughput(max(2, options.repeats // 2), options.out),
+        programs(100_000, 3, options.out),
     ]
     if not all(agree):
         raise SystemExit("ours and the peers disagree")

@@ -1,0 +1,87 @@
+"""The benchmark harness on sizes that take seconds: reports are right, comparisons notice a difference."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def common() -> Iterator[ModuleType]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        yield importlib.import_module("_common")
+
+
+@pytest.fixture(scope="module")
+def training(common: ModuleType) -> ModuleType:
+    return importlib.import_module("training")
+
+
+@pytest.fixture(scope="module")
+def learners(training: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    s = training.scale("smoke", envs=12, tiles=2)
+    ppo = s.navigation.ppo.model_copy(update={"steps": 6, "minibatches": 2, "epochs": 1})
+    s = s.model_copy(update={"navigation": s.navigation.model_copy(update={"ppo": ppo})})
+    world = training.load_world(s.world, tmp_path_factory.mktemp("cache"))
+    return {name: make(s, world) for name, make in training.MAKERS.items()}
+
+
+@pytest.mark.parametrize(("larger", "ratio"), [(False, 2.5), (True, 0.4)])
+def test_report(common: ModuleType, tmp_path: Path, larger: bool, ratio: float) -> None:
+    peers = {"slow": [50.0, 70.0, 60.0], "best": [6.0, 4.0, 5.0]} if not larger else {"best": [5.0], "slow": [0.1]}
+    common.report("x", "Work", "s", [1.0, 2.0, 9.0], peers, tmp_path, agree=True, larger_is_better=larger, extra=3)
+    record = json.loads((tmp_path / "x.json").read_text())
+    assert record["ours"] == 2.0
+    assert record["ratio_to_best_peer"] == pytest.approx(ratio)
+    assert record["extra"] == 3
+    assert {"work", "peers", "unit", "agree", "machine", "commit"} < record.keys()
+    table = (tmp_path / "x.md").read_text()
+    assert "| romnav | 2 | 1 to 9 |  |" in table
+    assert f"| {ratio:.2f} |" in table
+
+
+def test_works_take_turns_and_warm_up(common: ModuleType) -> None:
+    calls: list[str] = []
+    now = iter(range(100))
+    works = {name: lambda name=name: calls.append(name) for name in "ab"}
+    times = common.take_turns(works, 2, lambda: float(next(now)))
+    assert calls == ["a", "b"] * 3
+    assert times == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
+
+
+def test_children_are_processes_of_their_own(common: ModuleType) -> None:
+    runs = common.in_children(os.getpid, count=2)
+    assert os.getpid() not in [pid for pid, _ in runs]
+    assert all(peak > 1.0 for _, peak in runs)
+
+
+def test_peer_learns_the_same_task(training: ModuleType, learners: dict[str, Any]) -> None:
+    assert training.agreement(learners)
+    for learner in learners.values():
+        assert learner.iterate() > 0.0
+        assert all(map(math.isfinite, learner.losses.values()))
+
+
+def test_agreement_notices_other_weights(training: ModuleType, learners: dict[str, Any]) -> None:
+    with torch.no_grad():
+        learners["stock rsl-rl"].algorithm.actor.mlp[-2].bias += 1.0
+    assert not training.agreement(learners)
+
+
+def test_shares_cover_the_iteration(training: ModuleType, learners: dict[str, Any]) -> None:
+    parts = training.shares(learners["romnav"], 1)
+    assert sum(parts.values()) == pytest.approx(1.0)
+    assert {"LiDAR", "encoder", "update: attention", "update: GRU", "policy inference"} < parts.keys()
+    assert min(parts[k] for k in training.SENSING if k != "resets") > 0.0
