@@ -197,8 +197,8 @@ def measure(name: str, solids: list[Solids], poses: Poses, repeats: int, out: Pa
     """Measures one resolution, prints it and writes ``lidar-<name>.json``."""
     rows, columns = SIZES[name]
     spec = LidarSpec(rows=rows, columns=columns, field=(-90.0, 90.0))
-    lidar = Lidar(solids, 20.0, spec)
-    mesh = Lidar(solids, 20.0, spec.model_copy(update={"backend": "mesh"}))
+    lidar = Lidar(solids, spec)
+    mesh = Lidar(solids, spec.model_copy(update={"backend": "mesh"}))
     casts = {
         k: [make(s) for s in solids] for k, make in PEERS.items() if importlib.util.find_spec(MODULES[k])
     }

@@ -182,4 +182,4 @@ class Stages:
     def _lidar(self, settings: Scale, world: World) -> Lidar:
         from romnav.sensing.lidar import Lidar
 
-        return Lidar([tile.solids for tile in world.tiles], world.spec.side, settings.lidar, self.device)
+        return Lidar([tile.solids for tile in world.tiles], settings.lidar, self.device)

@@ -30,7 +30,6 @@ class Lidar:
 
     Args:
         solids: The solids of each tile.
-        side: Tile side, m.
         spec: Image and sensor.
         device: Where to compute, "cpu" or "cuda".
     """
@@ -38,7 +37,7 @@ class Lidar:
     directions: Tensor
     """(rows, columns, 3) unit vectors in the levelled LiDAR frame (x forward, y left, z up)."""
 
-    def __init__(self, solids: Sequence[Solids], side: float, spec: LidarSpec, device: str = "cpu") -> None:
+    def __init__(self, solids: Sequence[Solids], spec: LidarSpec, device: str = "cpu") -> None:
         self.spec = spec
         self.device = device
         width = math.radians(spec.azimuth)

@@ -50,8 +50,10 @@ class Sensor(Protocol):
     """A range sensor over the tiles to be learned from: `romnav.sensing.lidar.Lidar` is one."""
 
     directions: Tensor
-    scan: Callable[..., Any]
-    """(tile, origin, yaw, labels=...) as of the LiDAR."""
+
+    @property
+    def scan(self) -> Callable[..., Any]:
+        """(tile, origin, yaw, labels=...) -> ranges, or ranges and labels."""
 
 
 class Poses:

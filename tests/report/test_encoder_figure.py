@@ -29,7 +29,7 @@ def test_a_row_of_panels_per_tile_class_and_share(sensor_name: str, tmp_path: Pa
         tiles.append((tile, rasterise(tile, GridSpec())))
     solids = [tile.solids for tile, _ in tiles]
     if sensor_name == "lidar":
-        sensor, spec = Lidar(solids, 6.0, LidarSpec(rows=15, columns=55)), EncoderSpec()
+        sensor, spec = Lidar(solids, LidarSpec(rows=15, columns=55)), EncoderSpec()
     else:
         sensor, spec = DepthCamera(solids, DepthSpec()), DEPTH_PRETRAIN.encoder
     path = tmp_path / "encoder.png"

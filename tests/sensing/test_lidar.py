@@ -149,7 +149,7 @@ def poses(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
 
 @pytest.mark.parametrize("spec", [LidarSpec(), COARSE], ids=["paper", "coarse"])
 def test_ranges_and_labels_are_exact(spec: LidarSpec) -> None:
-    lidar = Lidar(TILES, SIDE, spec)
+    lidar = Lidar(TILES, spec)
     tile, origin, yaw = poses(6)
     ranges, labels = lidar.scan(tile, origin, yaw, labels=True)
     assert_exact(lidar, TILES, (tile, origin, yaw), ranges, labels)
@@ -170,7 +170,7 @@ def generated() -> tuple[list[Solids], tuple[Tensor, Tensor, Tensor]]:
 
 def test_tiles_of_each_class(generated: tuple[list[Solids], tuple[Tensor, Tensor, Tensor]]) -> None:
     solids, pose = generated
-    lidar = Lidar(solids, SIDE, COARSE)
+    lidar = Lidar(solids, COARSE)
     ranges, labels = lidar.scan(*pose, labels=True)
     assert_exact(lidar, solids, pose, ranges, labels)
     assert len(np.unique(labels)) >= 4
@@ -178,8 +178,8 @@ def test_tiles_of_each_class(generated: tuple[list[Solids], tuple[Tensor, Tensor
 
 def test_mesh_backend_agrees(generated: tuple[list[Solids], tuple[Tensor, Tensor, Tensor]]) -> None:
     solids, pose = generated
-    ranges, labels = Lidar(solids, SIDE, LidarSpec()).scan(*pose, labels=True)
-    mesh = Lidar(solids, SIDE, LidarSpec(backend="mesh"))
+    ranges, labels = Lidar(solids, LidarSpec()).scan(*pose, labels=True)
+    mesh = Lidar(solids, LidarSpec(backend="mesh"))
     mesh_ranges, mesh_labels = mesh.scan(*pose, labels=True)
     assert ((ranges - mesh_ranges).abs() > 0.01).float().mean() < 3e-4
     assert (labels != mesh_labels).float().mean() < 3e-4
@@ -191,7 +191,7 @@ def test_inside_a_solid_nothing_is_seen(backend: Literal["columns", "mesh"]) -> 
     ground(b)
     b.box((10.0, 10.0), (1.0, 1.0), (0.0, 2.0))
     spec = LidarSpec(rows=15, columns=55, backend=backend)
-    assert (scan_one(Lidar([b.build()], SIDE, spec), (10.0, 10.0, 1.265)) == 0).all()
+    assert (scan_one(Lidar([b.build()], spec), (10.0, 10.0, 1.265)) == 0).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -222,7 +222,7 @@ def test_any_single_solid(
     else:
         b.cylinder(centre, size[0] / 2, (base, base + thickness))
     solids = b.build()
-    lidar = Lidar([solids], SIDE, COARSE)
+    lidar = Lidar([solids], COARSE)
     truth, _ = expected(solids, np.zeros(3), 0.0, lidar)
     # rays along an edge may fall on either side of it
     assert (np.abs(scan_one(lidar, (0.0, 0.0, 0.0)) - truth) > 1e-3).sum() <= 2
@@ -236,7 +236,7 @@ def test_field_of_view_follows_the_torso() -> None:
         angle = math.pi / 2 * i
         b.box((10 + 9 * math.cos(angle), 10 + 9 * math.sin(angle)), (0.2, SIDE), (0, 3), yaw=angle)
     solids = b.build()
-    lidar = Lidar([solids], SIDE, LidarSpec())
+    lidar = Lidar([solids], LidarSpec())
     tilt = torch.tensor([[0.0, 0.0], [0.2, 0.0], [0.0, -0.15], [-0.1, 0.3]])
     zeros = torch.zeros(4, dtype=torch.int32)
     origin, yaw = torch.tensor([[10.0, 10.0, 1.265]]).repeat(4, 1), torch.full((4,), 0.3)
@@ -251,7 +251,7 @@ def test_field_of_view_follows_the_torso() -> None:
 
 
 def test_order_of_environments_and_threads_do_not_matter() -> None:
-    lidar = Lidar(TILES, SIDE, COARSE)
+    lidar = Lidar(TILES, COARSE)
     tile, origin, yaw = poses(31)
     ranges, labels = lidar.scan(tile, origin, yaw, labels=True)
     order = torch.randperm(31, generator=torch.Generator().manual_seed(0))
@@ -269,8 +269,8 @@ def test_order_of_environments_and_threads_do_not_matter() -> None:
 
 def test_coarse_image_is_a_subset_of_a_finer_one() -> None:
     tile, origin, yaw = poses(9)
-    fine = Lidar(TILES, SIDE, LidarSpec(rows=45, columns=165)).scan(tile, origin, yaw)
-    coarse = Lidar(TILES, SIDE, COARSE).scan(tile, origin, yaw)
+    fine = Lidar(TILES, LidarSpec(rows=45, columns=165)).scan(tile, origin, yaw)
+    coarse = Lidar(TILES, COARSE).scan(tile, origin, yaw)
     assert ((fine[:, 1::3, 1::3] - coarse).abs() > 1e-3).float().mean() < 1e-4
 
 
@@ -279,7 +279,7 @@ def test_thin_pole_is_seen(columns: int) -> None:
     b = SolidsBuilder()
     ground(b)
     b.cylinder((13.0, 10.0), 0.01, (0.0, 1.5))
-    lidar = Lidar([b.build()], SIDE, LidarSpec(columns=columns))
+    lidar = Lidar([b.build()], LidarSpec(columns=columns))
     # some column looks at the pole in the course of a turn by one pixel, as its width asks for
     turns = np.linspace(0, math.radians(220 / columns), 24 * 220 // columns)
     seen = sum((np.abs(scan_one(lidar, (10.0, 10.0, 1.265), yaw)[6] - 2.99) < 0.02).sum() for yaw in turns)
@@ -290,7 +290,7 @@ def test_thin_pole_is_seen(columns: int) -> None:
 def test_nothing_beyond_the_tile_but_solids() -> None:
     b = SolidsBuilder()
     ground(b)
-    lidar = Lidar([b.build()], SIDE, LidarSpec())
+    lidar = Lidar([b.build()], LidarSpec())
     image = scan_one(lidar, (19.0, 10.0, 1.265))
     ahead = image[:, 109:111]
     below = np.degrees(np.arcsin(lidar.directions[:, 110, 2].numpy()))
@@ -298,14 +298,14 @@ def test_nothing_beyond_the_tile_but_solids() -> None:
     assert (ahead[below > -math.degrees(math.atan(1.265))] == 0).all()
     assert (ahead[(below < -52.2) & (below > -54)] > 0).all()
     b.box((25.0, 10.0), (0.2, 10.0), (0.0, 3.0))
-    beyond = scan_one(Lidar([b.build()], SIDE, LidarSpec()), (19.0, 10.0, 1.265))
+    beyond = scan_one(Lidar([b.build()], LidarSpec()), (19.0, 10.0, 1.265))
     assert beyond[4, 110] == pytest.approx(5.9, abs=0.01)
 
 
 def test_limits_of_range() -> None:
     b = SolidsBuilder()
     b.box((0.0, 0.0), (0.1, 8.0), (-9.0, 9.0))
-    lidar = Lidar([b.build()], SIDE, LidarSpec(max_range=5.0))
+    lidar = Lidar([b.build()], LidarSpec(max_range=5.0))
     assert (scan_one(lidar, (-0.1, 0.0, 0.0))[:, 110] == 0).mean() > 0.9  # closer than the nearest return
     assert scan_one(lidar, (-4.9, 0.0, 0.0))[3, 110] == pytest.approx(4.85, abs=0.01)
     assert (scan_one(lidar, (-5.2, 0.0, 0.0)) == 0).all()

@@ -48,7 +48,7 @@ def tiles() -> list[tuple[Tile, Grids]]:
 
 @pytest.fixture(scope="module")
 def lidar(tiles: list[tuple[Tile, Grids]]) -> Lidar:
-    return Lidar([tile.solids for tile, _ in tiles], 8.0, LidarSpec(rows=15, columns=31))
+    return Lidar([tile.solids for tile, _ in tiles], LidarSpec(rows=15, columns=31))
 
 
 def test_divergence_is_that_of_gaussians() -> None:
