@@ -2,6 +2,7 @@
 
 Library kernels are made for long sequences; among ten tokens of eight channels they spend their time on packing.
 """
+# ruff: noqa: UP018 - in Warp, float() declares a variable that changes in a loop
 
 from __future__ import annotations
 
