@@ -40,7 +40,7 @@ def load_world(spec: WorldSpec, cache: Path = CACHE) -> World:
 def sensors(s: Scale, world: World) -> LidarPerception:
     """LiDAR, corruption and an encoder with random weights: what it computes costs the same as a trained one."""
     torch.manual_seed(0)
-    lidar = Lidar([tile.solids for tile in world.tiles], world.spec.side, s.lidar)
+    lidar = Lidar([tile.solids for tile in world.tiles], s.lidar)
     encoder = Autoencoder(s.pretrain.encoder, lidar.directions).encoder.eval().requires_grad_(False)
     return LidarPerception(lidar, Corruption(s.navigation.corruption, 0), encoder)
 

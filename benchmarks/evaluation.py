@@ -36,7 +36,7 @@ def driver(s: Scale, world: World, backend: str, options: argparse.Namespace) ->
     if options.encoder:
         perception = LidarPerception(perception.lidar, perception.corruption, encoders.load(options.encoder))
     spec = s.lidar.model_copy(update={"backend": backend})
-    perception.lidar = Lidar([tile.solids for tile in world.tiles], world.spec.side, spec)
+    perception.lidar = Lidar([tile.solids for tile in world.tiles], spec)
     if not options.policy:
         return Policy(ours(s, world).algorithm.actor, perception)
     tokens, digest = perception.encoder.token_shape, perception.encoder.digest()

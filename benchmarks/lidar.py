@@ -10,11 +10,7 @@ installed are left out: ``pip install romnav[bench]`` brings them.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import json
-import os
-import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -26,10 +22,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
+from _common import CORES, arguments, report
 from numpy.typing import NDArray
 
-from romnav import files
-from romnav.experiment import store
 from romnav.sensing.lidar import Lidar
 from romnav.sensing.spec import LidarSpec
 from romnav.world.mesh import triangulate
@@ -42,7 +37,6 @@ SAME = 0.01
 """Largest difference of a range that agrees, m; a column cell is 0.2 m."""
 CLOSE = 5.0
 """Range within which every solid that the exact cast sees must be seen, m."""
-CORES = os.cpu_count() or 1
 
 
 class Poses(NamedTuple):
@@ -65,9 +59,7 @@ def draw(count: int, tiles: int) -> tuple[list[Solids], Poses]:
     ground = np.stack([made[t][1].position[rng.integers(len(made[t][1].position))] for t in tile])
     ground += [0.0, 0.0, LidarSpec().height]
     yaw = torch.tensor(rng.uniform(-np.pi, np.pi, count), dtype=torch.float32)
-    return [t.solids for t, _ in made], Poses(
-        torch.tensor(tile, dtype=torch.int32), torch.tensor(ground), yaw
-    )
+    return [t.solids for t, _ in made], Poses(torch.tensor(tile, dtype=torch.int32), torch.tensor(ground), yaw)
 
 
 def rays(poses: Poses, directions: torch.Tensor) -> NDArray[np.float32]:
@@ -171,9 +163,7 @@ def scanned(lidar: Lidar, poses: Poses) -> tuple[torch.Tensor, float]:
     return ranges, time.perf_counter() - start
 
 
-def lost(
-    solids: list[Solids], poses: Poses, directions: torch.Tensor, same: NDArray[np.bool_]
-) -> tuple[int, int]:
+def lost(solids: list[Solids], poses: Poses, directions: torch.Tensor, same: NDArray[np.bool_]) -> tuple[int, int]:
     """Solids that an exact cast sees within `CLOSE`, summed over poses, and how many of them ours misses."""
     import open3d as o3d
 
@@ -199,9 +189,7 @@ def measure(name: str, solids: list[Solids], poses: Poses, repeats: int, out: Pa
     spec = LidarSpec(rows=rows, columns=columns, field=(-90.0, 90.0))
     lidar = Lidar(solids, spec)
     mesh = Lidar(solids, spec.model_copy(update={"backend": "mesh"}))
-    casts = {
-        k: [make(s) for s in solids] for k, make in PEERS.items() if importlib.util.find_spec(MODULES[k])
-    }
+    casts = {k: [make(s) for s in solids] for k, make in PEERS.items() if importlib.util.find_spec(MODULES[k])}
     ranges = lidar.scan(*poses).numpy()
     times: dict[str, list[float]] = {k: [] for k in ("romnav", "wp.mesh_query_ray", *casts)}
     agree = {}
@@ -220,47 +208,26 @@ def measure(name: str, solids: list[Solids], poses: Poses, repeats: int, out: Pa
             else:
                 times[key].append(seconds)
     rays_cast = ranges.size / 1e6
-    rate = {k: rays_cast / statistics.median(t) for k, t in times.items()}
-    print(f"{name}: {len(ranges)} poses x {rows} x {columns} rays, {len(solids)} tiles, {repeats} repeats")
-    for key, value in rate.items():
-        slowest, fastest = rays_cast / max(times[key]), rays_cast / min(times[key])
-        same = f"{agree[key].mean():.4%} of rays within {SAME} m of ours"
-        print(f"{key:20}{value:8.1f} M rays/s ({slowest:.1f} to {fastest:.1f}), {same}")
-    own = rate.pop("romnav")
-    best = max(rate, key=rate.__getitem__)
-    ratios = [b / o for b, o in zip(times[best], times["romnav"], strict=True)]
-    print(f"ours / {best}: {own / rate[best]:.2f} (by repeat {min(ratios):.2f} to {max(ratios):.2f})")
+    rates = {key: [rays_cast / seconds for seconds in values] for key, values in times.items()}
+    for key, same in agree.items():
+        print(f"{name}: {key:20} {same.mean():.4%} of rays within {SAME} m of ours")
     good = all(a.mean() >= 0.985 for a in agree.values())
     if "open3d" in casts:
         seen, missed = lost(solids, poses, lidar.directions, agree["open3d"])
         print(f"solids seen within {CLOSE} m by the exact cast: {seen}, of them lost: {missed}")
         good &= missed == 0
-    source = store.provenance()
-    record = {
-        "work": f"range images of {len(ranges)} poses, {rows} x {columns} rays, {len(solids)} tiles",
-        "ours": own,
-        "peers": rate,
-        "unit": "M rays/s",
-        "ratio_to_best_peer": own / rate[best],
-        "agree": good,
-        "machine": source["machine"],
-        "commit": source["commit"],
-    }
-    files.write(out / f"lidar-{name}.json", json.dumps(record, indent=2) + "\n")
+    work = f"Range images of {len(ranges)} poses, {columns} x {rows} rays, {len(solids)} tiles"
+    own = rates.pop("romnav")
+    report(f"lidar-{name}", work, "M rays/s", own, rates, out, agree=good, larger_is_better=True)
     return good
 
 
 def main() -> None:
     """Measures both resolutions."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--poses", type=int, default=2048)
-    parser.add_argument("--tiles", type=int, default=16)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results/bench")
-    arguments = parser.parse_args()
+    options = arguments(__doc__, poses=2048, tiles=16, repeats=3)
     torch.set_num_threads(CORES)
-    solids, poses = draw(arguments.poses, arguments.tiles)
-    good = [measure(name, solids, poses, arguments.repeats, arguments.out) for name in SIZES]
+    solids, poses = draw(options.poses, options.tiles)
+    good = [measure(name, solids, poses, options.repeats, options.out) for name in SIZES]
     if not all(good):
         sys.exit("a solid was lost, or fewer than 98.5 % of the rays agree")
 
