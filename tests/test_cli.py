@@ -34,9 +34,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def evaluated(project: Path, episode_rows: Callable[..., rows.EpisodeRows]) -> Path:
     """A project whose arms have episode rows."""
     for arm, skill in {"rom": 0.8, "uniform": 0.6, "nocap": 0.5, "oracle": 1.0, "straight": 0.2}.items():
-        rows.write(
-            project / "results" / "smoke" / arm / "seed-0" / "episodes.parquet", episode_rows(arm, skill)
-        )
+        rows.write(project / "results" / "smoke" / arm / "seed-0" / "episodes.parquet", episode_rows(arm, skill))
     return project
 
 
@@ -112,17 +110,13 @@ def test_a_typo_names_the_nearest(project: Path, words: list[str], message: str)
         ("spawn-goal.toml", "title =", "titel =", "key title is missing"),
     ],
 )
-def test_a_wrong_specification_names_file_and_key(
-    project: Path, file: str, old: str, new: str, message: str
-) -> None:
+def test_a_wrong_specification_names_file_and_key(project: Path, file: str, old: str, new: str, message: str) -> None:
     edit(project / "experiments" / file, old, new)
     assert fails("run", "ablation", "spawn-goal").startswith(f"{project / 'experiments' / file}: {message}")
     assert not (project / "results").exists()
 
 
-def test_outside_of_a_project_there_is_one_clear_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_outside_of_a_project_there_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert "no experiments/ here or above" in fails("list")
 

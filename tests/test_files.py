@@ -36,9 +36,7 @@ def test_bytes_and_text_are_written(tmp_path: Path) -> None:
 
 def test_a_file_in_place_of_the_folder_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "results").write_text("")
-    with pytest.raises(
-        RomnavError, match=r"results/out: cannot be written \((file exists|not a directory)\)"
-    ):
+    with pytest.raises(RomnavError, match=r"results/out: cannot be written \((file exists|not a directory)\)"):
         files.write(tmp_path / "results" / "out", "x")
 
 
@@ -71,9 +69,7 @@ def test_the_kernel_refuses_to_write_on(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
     files.write(tmp_path / "out", "old")
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True)
     assert "RomnavError: out: cannot be written (file too large)" in done.stderr
     assert os.listdir(tmp_path) == ["out"]
     assert (tmp_path / "out").read_text() == "old"

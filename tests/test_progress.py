@@ -18,9 +18,7 @@ def test_a_resumed_run_is_timed_by_its_own_work() -> None:
     meter = Meter(clock)
     meter.describe(500, 1000, "")  # what an earlier session did
     clock.now += 10.0
-    assert meter.describe(600, 1000, "success 12 %") == (
-        " 60% 600/1,000  10/s  0:10 elapsed  0:40 left  success 12 %"
-    )
+    assert meter.describe(600, 1000, "success 12 %") == (" 60% 600/1,000  10/s  0:10 elapsed  0:40 left  success 12 %")
 
 
 def test_another_total_is_another_task() -> None:

@@ -8,7 +8,6 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 from romnav.errors import RomnavError
 from romnav.experiment.plan import Plan, Stage
@@ -27,10 +26,12 @@ def stages_side_by_side(plan: Plan, stages: Sequence[Stage], resume: bool) -> No
     options = ["--scale", plan.scale.name, *([] if resume else ["--no-resume"])]
     commands = {s.name: [*COMMANDS[s.kind], str(s.arm), "--seed", str(s.seed), *options] for s in stages}
     if commands:
-        side_by_side(commands, plan.project.results, os.cpu_count() or 1)
+        elsewhere = plan.project.results != plan.project.root / "results"
+        where = ["--results", str(plan.project.results)] if elsewhere else []
+        side_by_side({name: [*where, *command] for name, command in commands.items()}, os.cpu_count() or 1)
 
 
-def side_by_side(commands: Mapping[str, Sequence[str]], results: Path, workers: int) -> None:
+def side_by_side(commands: Mapping[str, Sequence[str]], workers: int) -> None:
     """Run ``romnav`` command lines by the name of their stage, at most ``workers`` at a time.
 
     Their progress shows as one line each. When one fails, the others are stopped; what they have done is kept.
@@ -44,7 +45,7 @@ def side_by_side(commands: Mapping[str, Sequence[str]], results: Path, workers: 
     def run(name: str, arguments: Sequence[str]) -> None:
         if stop.is_set():
             return
-        command = [sys.executable, "-m", "romnav.cli", "--results", str(results), *arguments]
+        command = [sys.executable, "-m", "romnav.cli", *arguments]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         with subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment

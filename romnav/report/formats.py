@@ -24,9 +24,7 @@ class Cell:
     dagger: bool = False
 
 
-def number(
-    value: float, decimals: int, *, sign: bool = False, dagger: bool = False, **facts: float | None
-) -> Cell:
+def number(value: float, decimals: int, *, sign: bool = False, dagger: bool = False, **facts: float | None) -> Cell:
     """A cell that shows a value rounded to some decimals, without negative zero."""
     shown = round(value, decimals) + 0.0
     text = f"{shown:{'+' if sign else ''}.{decimals}f}" if math.isfinite(value) else "–"
@@ -88,8 +86,7 @@ def latex(table: Table) -> str:
         over = "".join(rf" & \multicolumn{{{width}}}{{c}}{{{_tex(text)}}}" for text, width in table.spans)
         ends = [1 + sum(width for _, width in table.spans[: k + 1]) for k in range(len(table.spans))]
         rules = "".join(
-            rf"\cmidrule(lr){{{end - width + 1}-{end}}}"
-            for end, (_, width) in zip(ends, table.spans, strict=True)
+            rf"\cmidrule(lr){{{end - width + 1}-{end}}}" for end, (_, width) in zip(ends, table.spans, strict=True)
         )
         spans = [over.lstrip() + r" \\", rules]
     else:
@@ -168,9 +165,7 @@ def _md_line(row: Sequence[str], widths: Sequence[int]) -> str:
 def to_csv(table: Table) -> str:
     """One line per number, unrounded, with its facts and provenance; empty where there are none."""
     text = io.StringIO()
-    facts = dict.fromkeys(
-        f for block in table.blocks for row in block.rows for c in row.cells for f in c.facts
-    )
+    facts = dict.fromkeys(f for block in table.blocks for row in block.rows for c in row.cells for f in c.facts)
     head = ["table", "source", "row", "column", "value", *facts, "bold", "dagger", *table.provenance]
     out = csv.DictWriter(text, head, lineterminator="\n")
     out.writeheader()

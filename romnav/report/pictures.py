@@ -30,9 +30,7 @@ PANE = 0.22
 LIGHT = np.array([0.30, 0.45, 0.84])
 
 
-def draw_tile(
-    tile: Tile, grids: Grids, path: Path, *, azimuth: float = -60.0, elevation: float = 38.0
-) -> None:
+def draw_tile(tile: Tile, grids: Grids, path: Path, *, azimuth: float = -60.0, elevation: float = 38.0) -> None:
     """Draw ``tile`` in 3D beside the grid of every layer and save it to ``path`` (type by its suffix).
 
     Walls and upper floors are translucent. Angles in degrees, of the viewer seen from the tile's centre.

@@ -23,9 +23,7 @@ def load(results_dir: Path, scale: str) -> list[rows.Arm]:
     folder = results_dir / scale
     files = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
     if not files:
-        raise RomnavError(
-            f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`"
-        )
+        raise RomnavError(f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`")
     return rows.pair(_read_in_place(file, scale) for file in files)
 
 

@@ -111,8 +111,7 @@ SPECS: tuple[PerformanceSpec | LevelsSpec, ...] = (
     ),
     LevelsSpec(
         "nav-levels",
-        "Paired contrasts of success rate by same-level and cross-level goals. "
-        f"Positive favours RoM-Nav; {_DAGGER}",
+        f"Paired contrasts of success rate by same-level and cross-level goals. Positive favours RoM-Nav; {_DAGGER}",
         _ROM_NAV,
         (_ROM_HUM, _SINGLE),
     ),
@@ -133,8 +132,7 @@ def build_all(arms: Sequence[Arm]) -> list[Table]:
     possible = [
         spec
         for spec in SPECS
-        if spec.reference.arm in bootstrap.arms
-        and len({e.arm for e in spec.entries} & set(bootstrap.arms)) > 1
+        if spec.reference.arm in bootstrap.arms and len({e.arm for e in spec.entries} & set(bootstrap.arms)) > 1
     ]
     if not possible:
         needed = " or ".join(sorted({spec.reference.arm for spec in SPECS}))
@@ -194,9 +192,7 @@ def _with_best(
         cells = {entry.arm: cell(entry.arm, column) for block in blocks for entry in block}
         shown = {arm: float(cells[arm].text) for arm in competing if math.isfinite(cells[arm].value)}
         best = column.best(list(shown.values())) if column.best and shown else None
-        return {
-            arm: dataclasses.replace(c, bold=shown.get(arm, math.nan) == best) for arm, c in cells.items()
-        }
+        return {arm: dataclasses.replace(c, bold=shown.get(arm, math.nan) == best) for arm, c in cells.items()}
 
     columns = [column_cells(column) for column in spec.columns]
     return [tuple(Row(e.label, tuple(cells[e.arm] for cells in columns)) for e in block) for block in blocks]
@@ -232,9 +228,7 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     shown = [bootstrap.arms[e.arm] for e in spec.entries if e.arm in bootstrap.arms]
     runs = [run for arm in shown for run in arm.runs]
     if not runs:
-        raise RomnavError(
-            f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first"
-        )
+        raise RomnavError(f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first")
     trained = [arm for arm in shown if any(run.provenance.steps for run in arm.runs)]
     facts = {
         "scale": _list(run.provenance.scale for run in runs),

@@ -210,9 +210,7 @@ def _draw(
         t0 = Lanes(0.0)
         t1 = Lanes(0.0)
         if solid.cylinder != 0:
-            t0, t1 = _disc(
-                solid.half_u, ou, ov, du, dv, wp.vec2i(wp.max(first - c, 0), wp.min(last + 1 - c, LANES))
-            )
+            t0, t1 = _disc(solid.half_u, ou, ov, du, dv, wp.vec2i(wp.max(first - c, 0), wp.min(last + 1 - c, LANES)))
         else:
             u0, u1 = _chord(solid.half_u, ou, du)
             v0, v1 = _chord(solid.half_v, ov, dv)

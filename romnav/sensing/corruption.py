@@ -8,9 +8,7 @@ from torch import Tensor
 from romnav.kernels import wp
 from romnav.sensing.spec import CorruptionSpec
 
-wp.set_module_options(
-    {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": "-march=native -w"}
-)
+wp.set_module_options({"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": "-march=native -w"})
 
 _GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
 _STRIDE = wp.constant(wp.uint32(0x9E3779B1))

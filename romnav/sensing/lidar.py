@@ -123,9 +123,7 @@ class Lidar:
         axis = self._axis(count, tilt)
 
         def launch(part: slice) -> None:
-            self._launch(
-                *(x[part] for x in pose), axis[part], ranges[part], None if classes is None else classes[part]
-            )
+            self._launch(*(x[part] for x in pose), axis[part], ranges[part], None if classes is None else classes[part])
 
         # a launch on the CPU runs on one thread, but releases the interpreter's lock
         threads = torch.get_num_threads() if self.device == "cpu" else 1
@@ -147,9 +145,7 @@ class Lidar:
             out = [wp.from_torch(ranges), None if labels is None else wp.from_torch(labels)]
             inputs = [meshes, self._first, label, directions, self.spec.max_range, *pose, *out]
             wp.launch(columns.cast_rays, (count, rows, width), inputs, device=self.device, stream=stream)
-            wp.launch(
-                columns.finish, count, [self._image, mount, *vectors], device=self.device, stream=stream
-            )
+            wp.launch(columns.finish, count, [self._image, mount, *vectors], device=self.device, stream=stream)
         else:
             sectors = 1 if self.device == "cpu" else width // columns.LANES
             inputs = [*self._scene, self._first, self._image, sectors, *pose, mount, *vectors]
@@ -160,6 +156,4 @@ class Lidar:
         roll, pitch = (torch.zeros(count, 2, device=self.device) if tilt is None else tilt.float()).unbind(1)
         x, z = -math.sin(self.spec.mount_pitch), -math.cos(self.spec.mount_pitch)
         up = roll.cos() * z
-        return torch.stack(
-            [pitch.cos() * x + pitch.sin() * up, -roll.sin() * z, pitch.cos() * up - pitch.sin() * x], 1
-        )
+        return torch.stack([pitch.cos() * x + pitch.sin() * up, -roll.sin() * z, pitch.cos() * up - pitch.sin() * x], 1)

@@ -334,7 +334,6 @@ def fields(grids: Grids, goals: NDArray[np.integer]) -> NDArray[np.uint16]:
     return solve([grids], [goals])[0].distance
 
 
-
 def solve(
     tiles: Sequence[Grids], goals: Sequence[NDArray[np.integer]], device: str = "cpu", workers: int = 0
 ) -> list[Geodesics]:

@@ -164,9 +164,7 @@ def test_what_is_finished_stays_when_a_later_stage_fails(chain: list[Stage]) -> 
             raise OSError(errno.ENOSPC, "No space left on device", str(stage.folder / "x.tmp"))
         return actions.copy_(stage, progress)
 
-    with pytest.raises(
-        RomnavError, match=r"b/x\.tmp: cannot be written \(no space left on device\); free some"
-    ):
+    with pytest.raises(RomnavError, match=r"b/x\.tmp: cannot be written \(no space left on device\); free some"):
         execute(pending(chain), {"copy": full})
     assert run(chain) == ["b", "c"]
 

@@ -118,9 +118,7 @@ def test_bold_is_the_best_competing_arm_and_never_the_time_of_the_ablation(built
     assert not any(cell.bold for bound in bounds for cell in bound.cells)
     for k, bold in enumerate((True, True, False, True)):
         best = max(float(r.cells[k].text) for r in competing)
-        assert [r.cells[k].bold for r in competing] == [
-            bold and float(r.cells[k].text) == best for r in competing
-        ]
+        assert [r.cells[k].bold for r in competing] == [bold and float(r.cells[k].text) == best for r in competing]
     cyl, humanoid = built["nav-perf"].blocks[:2]
     assert not any(cell.bold for cell in cyl.rows[0].cells)
     times = [float(r.cells[2].text) for r in humanoid.rows]
@@ -221,9 +219,7 @@ def test_published_contrasts_lie_between_their_levels() -> None:
             assert low <= difference <= high
 
 
-@pytest.mark.skipif(
-    not shutil.which("pdflatex"), reason="no LaTeX on this machine; read_latex checks the structure"
-)
+@pytest.mark.skipif(not shutil.which("pdflatex"), reason="no LaTeX on this machine; read_latex checks the structure")
 def test_the_tables_compile(built, tmp_path: Path) -> None:
     for table in built.values():
         formats.write(table, tmp_path)

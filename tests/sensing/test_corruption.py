@@ -48,9 +48,9 @@ def test_each_image_draws_its_own_share_of_lost_pixels() -> None:
 def test_share_and_pixels_follow_the_packages_random_numbers() -> None:
     out = Corruption(spec(dropout=(0.1, 0.5)), 3)(CLEAN, ENV, STEP)
     share = 0.1 + 0.4 * random.uniform(3, ENV, STEP, 0)
-    lost = (random.bits(3, ENV[:, None], STEP[:, None], torch.arange(1, 826)) >> 20) < (
-        share * 4096 + 0.5
-    ).long()[:, None]
+    lost = (random.bits(3, ENV[:, None], STEP[:, None], torch.arange(1, 826)) >> 20) < (share * 4096 + 0.5).long()[
+        :, None
+    ]
     assert torch.equal(out.flatten(1) == 0, lost)
 
 

@@ -18,9 +18,7 @@ SMALL = EncoderSpec(widths=(8, 16), strides=((2, 4), (2, 2)), latent=4)
 def fan(rows: int, columns: int) -> torch.Tensor:
     azimuth, elevation = torch.linspace(1.9, -1.9, columns), torch.linspace(0.07, -0.96, rows)[:, None]
     flat = elevation.cos()
-    return torch.stack(
-        [flat * azimuth.cos(), flat * azimuth.sin(), elevation.sin().expand(rows, columns)], -1
-    )
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), elevation.sin().expand(rows, columns)], -1)
 
 
 def scene(count: int, rows: int, columns: int) -> torch.Tensor:

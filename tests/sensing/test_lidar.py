@@ -91,9 +91,7 @@ def assert_exact(
 
 
 def scan_one(lidar: Lidar, origin: tuple[float, float, float], yaw: float = 0.0) -> NDArray:
-    return lidar.scan(torch.zeros(1, dtype=torch.int32), torch.tensor([origin]), torch.tensor([yaw]))[
-        0
-    ].numpy()
+    return lidar.scan(torch.zeros(1, dtype=torch.int32), torch.tensor([origin]), torch.tensor([yaw]))[0].numpy()
 
 
 def ground(builder: SolidsBuilder, height: float = 0.0) -> None:
@@ -131,9 +129,7 @@ def clutter(seed: int, count: int = 120) -> Solids:
                 )
             case _:
                 end = tuple(np.add(centre, rng.uniform(-2, 2, 2)))
-                b.segment(
-                    centre, end, 0.05, (z + 0.8, z + 0.9), rise=rng.uniform(-0.5, 0.5), label=Label.STAIR
-                )
+                b.segment(centre, end, 0.05, (z + 0.8, z + 0.9), rise=rng.uniform(-0.5, 0.5), label=Label.STAIR)
     return b.build()
 
 

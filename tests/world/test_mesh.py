@@ -48,11 +48,7 @@ def test_every_solid_is_closed_and_bounds_its_volume_from_outside(solids: Solids
         a, b, c = mesh.vertices[faces].transpose(1, 0, 2) - mesh.vertices[faces[0, 0]]
         volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
         half = solids.half[s]
-        area = (
-            4 * half.prod()
-            if solids.shape[s] == 0
-            else half[0] ** 2 * segments / 2 * np.sin(2 * np.pi / segments)
-        )
+        area = 4 * half.prod() if solids.shape[s] == 0 else half[0] ** 2 * segments / 2 * np.sin(2 * np.pi / segments)
         np.testing.assert_allclose(volume, area * (solids.top[s] - solids.bottom[s]), rtol=1e-9)
 
 

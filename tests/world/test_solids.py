@@ -30,9 +30,7 @@ def test_corners_are_the_local_half_extents_turned_counter_clockwise(
 
 @settings(deadline=None)
 @given(coordinate, coordinate, coordinate, coordinate, st.floats(-2.0, 2.0))
-def test_a_segment_runs_from_start_to_end_and_rises(
-    x0: float, y0: float, x1: float, y1: float, rise: float
-) -> None:
+def test_a_segment_runs_from_start_to_end_and_rises(x0: float, y0: float, x1: float, y1: float, rise: float) -> None:
     if np.hypot(x1 - x0, y1 - y0) < 1e-2:
         return
     builder = SolidsBuilder()

@@ -63,9 +63,7 @@ def test_all_nodes_are_one_component_by_breadth_first_search(name: str, tiles: C
         assert all(seen)
         for storey in tile.storeys:
             floor = (
-                (grids.layer == storey)
-                & ~grids.connector
-                & (np.abs(grids.position[:, 2] - tile.layers[storey]) < 0.01)
+                (grids.layer == storey) & ~grids.connector & (np.abs(grids.position[:, 2] - tile.layers[storey]) < 0.01)
             )
             assert floor.sum() * grids.cell**2 > 20.0 or tile.kind is TileClass.OUTDOOR
 
@@ -139,9 +137,7 @@ def test_heights_are_what_a_vertical_ray_hits_and_no_two_surfaces_coincide(
             cells = rng.integers(0, grids.height.shape[1], (40, 2))
             xy = (cells + 0.5) * grids.cell
             # a nudge off the triangles' edges, which the strict ray test would miss
-            for (i, j), (_, z) in zip(
-                cells, vertical_hits(mesh, xy + np.array([1.3e-7, 0.7e-7])), strict=True
-            ):
+            for (i, j), (_, z) in zip(cells, vertical_hits(mesh, xy + np.array([1.3e-7, 0.7e-7])), strict=True):
                 height = grids.height[layer, i, j]
                 if len(z) == 0:
                     assert np.isnan(height)

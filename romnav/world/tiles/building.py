@@ -104,17 +104,13 @@ def _span(rng: np.random.Generator, storeys: int) -> tuple[int, int]:
     return first, int(rng.integers(first + 1, storeys))
 
 
-def _draw_core(
-    rng: np.random.Generator, spec: WorldSpec, plan: Plan, row: int, first: int, last: int
-) -> Core | None:
+def _draw_core(rng: np.random.Generator, spec: WorldSpec, plan: Plan, row: int, first: int, last: int) -> Core | None:
     v0, v1 = plan.row(row)
     depth, length = v1 - v0, plan.length - 2 * WALL
     for _ in range(20):
         kind = int(rng.choice(4, p=(0.3, 0.2, 0.25, 0.25)))
         width, half = float(rng.uniform(1.4, 1.8)), spec.storey_height / 2
-        flight = (
-            draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width)
-        )
+        flight = draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width)
         stairs = Staircase(flight, float(rng.uniform(1.4, 1.8)), turn=kind != 2, walled=rng.random() < 0.35)
         wide, reach = 2 * stairs.half_width, stairs.length
         along = reach + APPROACH * (1 if stairs.turn else 2)

@@ -24,9 +24,7 @@ class Item:
     """Whether its back (v = -width/2) stands against a wall."""
 
 
-def _table(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _table(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     height = float(rng.uniform(0.70, 0.78))
     u, v = length / 2, width / 2
     block(b, f, (-u, u), (-v, v), (z + height - 0.04, z + height))
@@ -35,9 +33,7 @@ def _table(
             b.cylinder(f.at(su * (u - 0.06), sv * (v - 0.06)), 0.03, (z, z + height - 0.04))
 
 
-def _chair(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _chair(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     u, v = length / 2, width / 2
     block(b, f, (-u, u), (-v, v), (z + 0.42, z + 0.46))
     block(b, f, (-u, u), (-v, -v + 0.04), (z + 0.46, z + 0.9))
@@ -46,9 +42,7 @@ def _chair(
             b.cylinder(f.at(su * (u - 0.03), sv * (v - 0.03)), 0.02, (z, z + 0.42))
 
 
-def _desk(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _desk(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     _table(b, rng, f.sub(0.0, -width / 2 + 0.35), z, length, 0.7)
     _chair(
         b,
@@ -60,9 +54,7 @@ def _desk(
     )
 
 
-def _dining(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _dining(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     _table(b, rng, f, z, length - 0.4, width - 1.0)
     for side in (0.0, np.pi):
         for u in np.arange(-(length - 1.2) / 2, (length - 1.2) / 2 + 0.01, 0.7):
@@ -71,28 +63,20 @@ def _dining(
             _chair(b, rng, Frame(at.x, at.y, f.yaw + turn), z, 0.42, 0.42)
 
 
-def _shelf(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _shelf(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     u, v, height = length / 2, width / 2, float(rng.uniform(1.2, 2.1))
     block(b, f, (-u, u), (-v, -v + 0.02), (z, z + height))
     for s in (-1, 1):
         block(b, f, (s * (u - 0.015) - 0.015, s * (u - 0.015) + 0.015), (-v + 0.02, v), (z, z + height))
     for level in np.linspace(0.08, height - 0.04, 5):
-        block(
-            b, f, (-u + 0.03, u - 0.03), (-v + 0.02, v), (z + float(level) - 0.015, z + float(level) + 0.015)
-        )
+        block(b, f, (-u + 0.03, u - 0.03), (-v + 0.02, v), (z + float(level) - 0.015, z + float(level) + 0.015))
 
 
-def _cabinet(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _cabinet(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     block(b, f, (-length / 2, length / 2), (-width / 2, width / 2), (z, z + float(rng.uniform(0.75, 2.0))))
 
 
-def _sofa(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _sofa(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     u, v = length / 2, width / 2
     block(b, f, (-u + 0.18, u - 0.18), (-v + 0.22, v), (z + 0.08, z + 0.43))
     block(b, f, (-u + 0.18, u - 0.18), (-v, -v + 0.22), (z + 0.08, z + 0.85))
@@ -106,43 +90,33 @@ def _bed(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length:
     block(b, f, (-u, u), (-v, -v + 0.06), (z, z + 0.95))
 
 
-def _plant(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _plant(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     pot = float(rng.uniform(0.3, 0.45))
     b.cylinder((f.x, f.y), length / 2, (z, z + pot))
     b.cylinder((f.x, f.y), 0.03, (z + pot, z + pot + 0.4))
     b.cylinder((f.x, f.y), length * 0.6, (z + pot + 0.4, z + pot + float(rng.uniform(0.8, 1.2))))
 
 
-def _pillar(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _pillar(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     if rng.random() < 0.5:
         b.cylinder((f.x, f.y), length / 2, (z, z + 3.8))
     else:
         block(b, f, (-length / 2, length / 2), (-length / 2, length / 2), (z, z + 3.8))
 
 
-def _pole(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _pole(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     b.cylinder((f.x, f.y), float(rng.uniform(0.015, 0.05)), (z, z + float(rng.uniform(1.2, 2.6))))
     b.cylinder((f.x, f.y), 0.16, (z, z + 0.03))
 
 
-def _hanging(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _hanging(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     low = z + float(rng.uniform(0.95, 1.3))
     high = low + float(rng.uniform(0.15, 0.5))
     block(b, f, (-length / 2, length / 2), (-width / 2, width / 2), (low, high))
     b.cylinder((f.x, f.y), 0.01, (high, z + 3.8))
 
 
-def _crate(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _crate(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     height = float(rng.uniform(0.25, 0.7))
     block(b, f, (-length / 2, length / 2), (-width / 2, width / 2), (z, z + height))
     if rng.random() < 0.4:
@@ -151,9 +125,7 @@ def _crate(
         block(b, top, (-k, k), (-k, k), (z + height, z + height + float(rng.uniform(0.2, 0.5))))
 
 
-def _bench(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _bench(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     u, v = length / 2, width / 2
     block(b, f, (-u, u), (-v, v), (z + 0.4, z + 0.46))
     for s in (-1, 1):
@@ -162,9 +134,7 @@ def _bench(
         block(b, f, (-u, u), (-v, -v + 0.04), (z + 0.5, z + 0.9))
 
 
-def _planter(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _planter(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     height = float(rng.uniform(0.35, 0.6))
     block(b, f, (-length / 2, length / 2), (-width / 2, width / 2), (z, z + height))
     for u in np.arange(-length / 2 + 0.3, length / 2 - 0.29, 0.55):
@@ -172,9 +142,7 @@ def _planter(
         b.cylinder(f.at(float(u), 0.0), min(0.25, width * 0.4), (z + height, z + top))
 
 
-def _tree(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _tree(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     fork = float(rng.uniform(1.9, 2.6))
     crown = float(rng.uniform(0.7, 1.15))
     b.cylinder((f.x, f.y), float(rng.uniform(0.08, 0.18)), (z, z + fork))
@@ -183,24 +151,18 @@ def _tree(
     b.cylinder((f.x, f.y), 0.6 * crown, (z + fork + 1.4, z + fork + 2.1))
 
 
-def _bollard(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _bollard(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     b.cylinder((f.x, f.y), float(rng.uniform(0.05, 0.1)), (z, z + float(rng.uniform(0.7, 1.0))))
 
 
-def _lamp(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _lamp(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     height = z + float(rng.uniform(3.2, 4.2))
     b.cylinder((f.x, f.y), 0.12, (z, z + 0.3))
     b.cylinder((f.x, f.y), 0.05, (z + 0.3, height))
     b.cylinder((f.x, f.y), 0.25, (height, height + 0.2))
 
 
-def _sign(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _sign(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     low = z + float(rng.uniform(0.9, 1.3))
     for s in (-1, 1):
         b.cylinder(f.at(s * (length / 2 - 0.05), 0.0), 0.03, (z, low + 0.6))
@@ -213,14 +175,10 @@ def _car(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length:
     block(b, f, (-0.55 * u, 0.65 * u), (-v + 0.1, v - 0.1), (z + 0.85, z + 1.45))
     for su in (-0.62, 0.62):
         for sv in (-1, 1):
-            block(
-                b, f, (su * u - 0.3, su * u + 0.3), (sv * (v - 0.1) - 0.1, sv * (v - 0.1) + 0.1), (z, z + 0.2)
-            )
+            block(b, f, (su * u - 0.3, su * u + 0.3), (sv * (v - 0.1) - 0.1, sv * (v - 0.1) + 0.1), (z, z + 0.2))
 
 
-def _barrier(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _barrier(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     for s in (-1, 1):
         block(
             b,
@@ -232,9 +190,7 @@ def _barrier(
     block(b, f, (-length / 2, length / 2), (-0.02, 0.02), (z + 0.6, z + 0.9))
 
 
-def _portal(
-    b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float
-) -> None:
+def _portal(b: SolidsBuilder, rng: np.random.Generator, f: Frame, z: float, length: float, width: float) -> None:
     head = z + float(rng.uniform(1.45, 1.9))
     for s in (-1, 1):
         at = s * (length / 2 - 0.075)
@@ -311,11 +267,7 @@ def furnish(
             if item.wall:
                 at = _against_wall(rng, frame, size, length, width)
             else:
-                yaw = (
-                    float(rng.uniform(0.0, np.pi))
-                    if rng.random() < turn
-                    else float(rng.integers(2)) * np.pi / 2
-                )
+                yaw = float(rng.uniform(0.0, np.pi)) if rng.random() < turn else float(rng.integers(2)) * np.pi / 2
                 at = frame.sub(float(rng.uniform(0.0, size[0])), float(rng.uniform(0.0, size[1])), yaw)
             clear = 0.0 if item.wall else gap
             u, v = (-length / 2, length / 2), (-width / 2, width / 2)
@@ -332,7 +284,5 @@ def _against_wall(
     span = size[side % 2]
     along = float(rng.uniform(0.0, 1.0)) * max(span - length, 0.0) + length / 2
     off = width / 2 + 0.01
-    u, v = ((along, off), (size[0] - off, along), (size[0] - along, size[1] - off), (off, size[1] - along))[
-        side
-    ]
+    u, v = ((along, off), (size[0] - off, along), (size[0] - along, size[1] - off), (off, size[1] - along))[side]
     return frame.sub(u, v, side * np.pi / 2)

@@ -55,9 +55,7 @@ class Plot:
 
 def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     """A fenced piece of terrain in one of three layouts, with street furniture."""
-    layout: Callable[[np.random.Generator, float], list[Plot]] = (_terraces, _street, _park)[
-        int(rng.integers(3))
-    ]
+    layout: Callable[[np.random.Generator, float], list[Plot]] = (_terraces, _street, _park)[int(rng.integers(3))]
     plots = layout(rng, spec.side)
     site = _Site(rng, spec)
     site.join(plots)
@@ -202,8 +200,7 @@ class _Site:
                 continue
             brink = 0.0 if inset else flight.length
             if plots is not None and not (
-                plots[0].contains(foot, (-1.3, brink), v)
-                and plots[1].contains(foot, (brink, flight.length + 1.3), v)
+                plots[0].contains(foot, (-1.3, brink), v) and plots[1].contains(foot, (brink, flight.length + 1.3), v)
             ):
                 continue
             add_flight(self.solids, foot, z, flight, (0, 0), base=z - 0.1)

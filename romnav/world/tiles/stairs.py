@@ -208,9 +208,7 @@ class Staircase:
             points += [(end, 0.0, mid), (end + f.length, 0.0, top), (end + f.length + MOUTH, 0.0, top)]
         return Connector(self.kind, frame.path(points), f.width, (layer, layer + 2))
 
-    def guard(
-        self, solids: SolidsBuilder, frame: Frame, z: float, railing: Railing, *, departs: bool
-    ) -> None:
+    def guard(self, solids: SolidsBuilder, frame: Frame, z: float, railing: Railing, *, departs: bool) -> None:
         """Railings on the floor at ``z`` around the shaft, and across its mouth if no flight ``departs``."""
         if self.walled and departs:
             return
