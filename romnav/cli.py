@@ -109,12 +109,12 @@ def ablation(
 ) -> None:
     """Train and evaluate every arm of an ablation, then write and print its tables."""
     from romnav.experiment.launch import stages_side_by_side
-    from romnav.experiment.run import EVERYTHING, pending
+    from romnav.experiment.run import EVERYTHING
 
     plan = _plan(ctx, scale)
     seeds = plan.project.experiment(name).seeds if seed is None else (seed,)
     tables = plan.tables(name, seeds)
-    stages = pending([tables], () if resume else EVERYTHING)
+    stages = _pending([tables], resume, EVERYTHING)
     if device == "cpu":
         _perform(plan, [stage for stage in stages if stage.kind == "encoder"], device, resume)
         for kind in ("policy", "episodes"):
@@ -285,12 +285,16 @@ def _plan(ctx: typer.Context, scale: str) -> Plan:
 
 def _execute(plan: Plan, targets: list[Stage], device: str, resume: bool, kinds: Collection[str]) -> None:
     """Runs what the targets need; without ``resume``, stages of the given ``kinds`` start over."""
+    _perform(plan, _pending(targets, resume, kinds), device, resume)
+
+
+def _pending(targets: list[Stage], resume: bool, kinds: Collection[str]) -> list[Stage]:
     from romnav.experiment.run import pending
 
     stages = pending(targets, () if resume else kinds)
-    _perform(plan, stages, device, resume)
     if not stages:
         typer.echo("nothing to do: everything is finished and up to date", err=True)
+    return stages
 
 
 def _perform(plan: Plan, stages: list[Stage], device: str, resume: bool) -> None:
