@@ -6,7 +6,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -84,6 +83,7 @@ def report(
         "agree": agree,
         **more,
         "machine": source["machine"],
+        "load": os.getloadavg()[1],
         "commit": source["commit"],
     }
     files.write(out / f"{name}.json", json.dumps(record, indent=2) + "\n")
@@ -104,4 +104,6 @@ def in_children(work: Callable[..., Any], *inputs: Any, count: int = 1) -> list[
 
 def _with_peak(work: Callable[..., Any], *inputs: Any) -> tuple[Any, float]:
     result = work(*inputs)
-    return result, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    # not getrusage: its peak begins with that of the parent
+    status = Path("/proc/self/status").read_text().split()
+    return result, int(status[status.index("VmHWM:") + 1]) / 1024

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,12 +71,12 @@ class Learner:
                 self.algorithm.process_env_step(self.obs, reward, dones, extras)
             self.algorithm.compute_returns(self.obs)
 
-    def iterate(self) -> float:
-        """One rollout and one update; nav-steps/s, learning included."""
-        start = time.perf_counter()
+    def iterate(self, clock: Callable[[], float] = time.perf_counter) -> float:
+        """One rollout and one update; nav-steps/s of ``clock``, learning included."""
+        start = clock()
         self.rollout()
         self.losses = self.algorithm.update()
-        return self.steps * self.env.num_envs / (time.perf_counter() - start)
+        return self.steps * self.env.num_envs / (clock() - start)
 
 
 def ours(s: Scale, world: World) -> Learner:

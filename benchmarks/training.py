@@ -4,7 +4,8 @@ Both sense, encode, act, step and learn on the same world with the same network,
 minibatches (the "cpu" scale). The peer is what one builds from rsl-rl's parts: `RolloutStorage` keeps the range
 images, recurrent minibatches are cut at episode ends and padded, `PPO` evaluates the frozen CNN inside the actor
 in every pass, attention is PyTorch's and the memory is `torch.nn.GRU`. It drives the same environment, so that
-the ratio is the learner's alone.
+the ratio is the learner's alone. Compared are CPU seconds of one thread, as trainings run side by side with a
+thread each; beside it, the speed of as many runs as there are cores.
 
 The peer's weights are copied from ours; both must command the same actions and, given the same actions, see the same
 transitions.
@@ -244,7 +245,7 @@ def alone_on_a_thread(name: str, repeats: int) -> float:
 def main() -> None:
     """Measure, print and write ``results/bench/training.json``."""
     options = arguments(__doc__, repeats=3)
-    torch.set_num_threads(CORES)
+    torch.set_num_threads(1)
     s = scale()
     world = load_world(s.world)
     learners = {name: make(s, world) for name, make in MAKERS.items()}
@@ -252,7 +253,7 @@ def main() -> None:
     rates: dict[str, list[float]] = {name: [] for name in learners}
     for turn in range(options.repeats + 1):
         for name, learner in learners.items():
-            rate = learner.iterate()
+            rate = learner.iterate(time.process_time)
             if turn:
                 rates[name].append(rate)
             agree &= all(torch.tensor(list(learner.losses.values())).isfinite())
@@ -269,7 +270,7 @@ def main() -> None:
     report(
         "training",
         work,
-        "nav-steps/s",
+        "nav-steps per CPU second",
         rates.pop("romnav"),
         rates,
         options.out,
