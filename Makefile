@@ -30,6 +30,7 @@ tables: setup
 	$(BIN)/romnav tables --scale $(SCALE)
 
 bench: setup
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/romnav bench
 
 nightly: setup
