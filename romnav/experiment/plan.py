@@ -53,7 +53,9 @@ class Stage:
         used = {name: attrgetter(name)(self.settings) for name in self.uses}
         plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in used.items()}
         read = {path.name: digest(path) if path.exists() else None for path in self.reads}
-        return {"arm": self.arm, "seed": self.seed, **plain, **read}
+        # through JSON, as the record is: a tuple there is a list
+        data: dict[str, Any] = json.loads(json.dumps({"arm": self.arm, "seed": self.seed, **plain, **read}))
+        return data
 
     @cached_property
     def key(self) -> str:

@@ -56,7 +56,12 @@ def require_trained(evaluations: Iterable[Stage]) -> None:
     for policy in (stage for evaluation in evaluations for stage in evaluation.upstream if stage.kind == "policy"):
         if not store.finished(policy):
             changed = "; ".join(store.differences(policy))
-            reason = f"was trained with other settings ({changed})" if changed else "is not trained"
+            if changed:
+                reason = f"was trained with other settings ({changed})"
+            elif policy.record.exists():
+                reason = "is unfinished, or its encoder has changed since"
+            else:
+                reason = "is not trained"
             raise RomnavError(f"{policy.folder}: {policy.name} {reason}; run `romnav train policy {policy.arm}`")
 
 

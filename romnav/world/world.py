@@ -56,8 +56,6 @@ class World:
     """(S,) int64 nodes on or at the mouth of a stair or ramp, tile after tile."""
     spawn_start: Tensor
     """(T + 1,) int64 first entry of `spawn` of each tile."""
-    multi_story: Tensor
-    """(T,) bool."""
     storeys: Tensor
     """(T,) int64 number of floors."""
     goal: Tensor
@@ -194,7 +192,6 @@ def pack(
         node_start=torch.from_numpy(node_start),
         spawn=torch.from_numpy(np.concatenate(spawn)),
         spawn_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(s) for s in spawn])])),
-        multi_story=torch.tensor([tile.multi_story for tile in tiles]),
         storeys=torch.tensor([len(tile.storeys) for tile in tiles]),
         goal=torch.from_numpy(np.concatenate([g + s for g, s in zip(goals, node_start, strict=False)])),
         goal_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(g) for g in goals])])),

@@ -99,6 +99,17 @@ def test_arrival_is_counted_and_truncated_after_the_stay(
     assert (statistics.episodes, statistics.success) == (12, 1.0)
 
 
+def test_stalled_episodes_are_truncated_after_the_patience(
+    world: World, perception: object, spec: NavigationSpec
+) -> None:
+    env = make(world, perception, spec.env.model_copy(update={"duration": 45.0, "stay": 45.0, "patience": 2.0}))
+    env.episode_length_buf[:] = 0
+    for step in range(1, 11):
+        _, _, done, extras = env.step(torch.zeros(12, 3))
+        assert bool(done.all()) == (step == 10)  # standing still, never nearer, 2 s at 5 Hz
+        assert torch.equal(done, extras["time_outs"])
+
+
 def test_reward_statistics_add_up(world: World, perception: object, spec: NavigationSpec) -> None:
     env = make(world, perception, spec.env)
     env.statistics()
