@@ -39,8 +39,7 @@ def driver(s: Scale, world: World, backend: str, options: argparse.Namespace) ->
     perception.lidar = Lidar([tile.solids for tile in world.tiles], spec)
     if not options.policy:
         return Policy(ours(s, world).algorithm.actor, perception)
-    tokens, digest = perception.encoder.token_shape, perception.encoder.digest()
-    return Policy(checkpoint.load_actor(options.policy, tokens, digest), perception)
+    return Policy(checkpoint.load_actor(options.policy, perception.encoder), perception)
 
 
 def paired(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> tuple[float, float]:

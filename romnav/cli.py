@@ -127,13 +127,19 @@ def ablation(
 @train.command()
 def encoder(
     ctx: typer.Context,
+    sensor: Annotated[str | None, typer.Argument(help="lidar or depth; default: both.")] = None,
     scale: ScaleOption = "smoke",
     device: DeviceOption = "cpu",
     resume: ResumeOption = True,
 ) -> None:
-    """Pretrain the LiDAR encoder."""
+    """Pretrain the encoders, then measure and draw what they make of tiles that they have not seen."""
+    from romnav.experiment.plan import PRETRAINING
+    from romnav.experiment.spec import suggest
+
     plan = _plan(ctx, scale)
-    _execute(plan, [plan.encoder()], device, resume, {"encoder"})
+    if sensor and sensor not in PRETRAINING:
+        raise RomnavError(f"unknown sensor {sensor}{suggest(sensor, PRETRAINING)}")
+    _execute(plan, [plan.quality(s) for s in ([sensor] if sensor else PRETRAINING)], device, resume, {"encoder"})
 
 
 @train.command()

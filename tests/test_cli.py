@@ -92,6 +92,7 @@ def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> N
         (["run", "ablation", "spawn-goal", "--scale", "smok"], "unknown scale smok; did you mean smoke?"),
         (["train", "policy", "unifrom"], "unknown arm unifrom; did you mean uniform?"),
         (["train", "encoder", "--device", "cdua"], "device cdua: "),
+        (["train", "encoder", "lidra"], "unknown sensor lidra; did you mean lidar?"),
         (["bench", "nothing-like-it"], "unknown benchmark nothing-like-it; there are"),
     ],
 )

@@ -75,6 +75,7 @@ class Policy:
     def __init__(self, actor: NavigationActor, perception: LidarPerception) -> None:
         self.actor = actor
         self.perception = perception
+        perception.images = actor.encoder is not None
         actor.reset()
 
     def command(self, view: View) -> Tensor:

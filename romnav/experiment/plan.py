@@ -17,6 +17,9 @@ from romnav.experiment.project import Project
 from romnav.experiment.scales import Scale, ScaleFile
 from romnav.experiment.spec import SCRIPTED, suggest
 
+PRETRAINING = {"lidar": "pretrain", "depth": "pretrain_depth"}
+"""Section of a scale that tells how the encoder of a sensor is trained, by the section of the sensor."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -42,6 +45,8 @@ class Stage:
     """Stages whose output it reads."""
     scratch: tuple[str, ...] = ()
     """Files from which an interrupted run continues; useless once a setting has changed."""
+    sensor: str | None = None
+    """Sensor whose encoder it trains or judges."""
     arm: str | None = None
     """Arm that it trains or evaluates."""
     seed: int | None = None
@@ -90,26 +95,44 @@ class Plan:
         name, experiment = self.project.having(arm)
         return self.scale.changed(arm, experiment.arms[arm], self.project.file(name))
 
-    def encoder(self, settings: Scale | None = None) -> Stage:
-        """The LiDAR encoder; an arm that changes it gets one of its own."""
+    def encoder(self, settings: Scale | None = None, sensor: str = "lidar") -> Stage:
+        """The encoder of a sensor (a key of `PRETRAINING`); an arm that changes it gets one of its own."""
+        folder = self.folder / "encoder" / sensor
         stage = Stage(
             kind="encoder",
-            name="encoder lidar",
-            folder=self.folder / "encoder" / "lidar",
+            name=f"encoder {sensor}",
+            folder=folder,
             outputs=("encoder.pt", "curve.csv"),
-            record=self.folder / "encoder" / "lidar" / "encoder.json",
+            record=folder / "encoder.json",
             settings=settings or self.scale.settings,
-            uses=("world", "lidar", "pretrain"),
+            uses=("world", sensor, PRETRAINING[sensor]),
             scratch=("state.pt",),
+            sensor=sensor,
         )
-        if settings is None or stage.key == self.encoder().key:
+        if settings is None or stage.key == self.encoder(sensor=sensor).key:
             return stage
-        folder = stage.folder.with_name(f"lidar-{stage.key[:8]}")
+        folder = folder.with_name(f"{sensor}-{stage.key[:8]}")
         return replace(stage, name=f"encoder {folder.name}", folder=folder, record=folder / "encoder.json")
+
+    def quality(self, sensor: str) -> Stage:
+        """What the encoder of a sensor makes of images from tiles that it was not trained on."""
+        encoder = self.encoder(sensor=sensor)
+        return Stage(
+            kind="quality",
+            name=f"quality of encoder {sensor}",
+            folder=encoder.folder,
+            outputs=("quality.json", "encoder.png"),
+            record=encoder.folder / "held-out.json",
+            settings=self.scale.settings,
+            uses=("quality",),
+            upstream=(encoder,),
+            sensor=sensor,
+        )
 
     def policy(self, arm: str, seed: int) -> Stage:
         """The trained policy of an arm."""
         settings = self.settings(arm)
+        pretrained = settings.navigation.encoder.pretrained
         folder = self.folder / arm / f"seed-{seed}"
         return Stage(
             kind="policy",
@@ -118,8 +141,8 @@ class Plan:
             outputs=("policy.pt", "curve.csv"),
             record=folder / "spec.json",
             settings=settings,
-            uses=("world", "lidar", "navigation"),
-            upstream=(self.encoder(settings),),
+            uses=("world", "lidar", "navigation", *(() if pretrained else ("pretrain.encoder",))),
+            upstream=(self.encoder(settings),) if pretrained else (),
             scratch=("checkpoint.pt", "curve.csv"),
             arm=arm,
             seed=seed,

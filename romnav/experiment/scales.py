@@ -11,7 +11,7 @@ from romnav.errors import RomnavError
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.experiment.spec import Arm, parse, read_toml, suggest
 from romnav.navigation.spec import NavigationSpec
-from romnav.sensing.spec import LidarSpec, PretrainSpec
+from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
 
 
@@ -23,7 +23,13 @@ class Scale(Config):
     lidar: LidarSpec = LidarSpec()
     """Range image."""
     pretrain: PretrainSpec = PretrainSpec()
-    """Encoder and its training."""
+    """Encoder of the range image and its training."""
+    depth: DepthSpec = DepthSpec()
+    """Depth image."""
+    pretrain_depth: DepthPretrainSpec = DepthPretrainSpec()
+    """Encoder of the depth image and its training."""
+    quality: QualitySpec = QualitySpec()
+    """Judging the encoders."""
     navigation: NavigationSpec = NavigationSpec()
     """Task, policy and reinforcement learning."""
     evaluation: EvaluationSpec = EvaluationSpec()

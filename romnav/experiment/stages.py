@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from romnav import __version__
+from romnav import __version__, files
 from romnav.errors import RomnavError
 from romnav.experiment import store
-from romnav.experiment.plan import Plan, Stage, digest
+from romnav.experiment.plan import PRETRAINING, Plan, Stage, digest
 from romnav.experiment.run import Action
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import SCRIPTED, Experiment
@@ -18,8 +19,10 @@ from romnav.progress import Progress
 
 if TYPE_CHECKING:
     from romnav.navigation.perception import LidarPerception
+    from romnav.sensing.depth import DepthCamera
     from romnav.sensing.lidar import Lidar
     from romnav.world.spec import WorldSpec
+    from romnav.world.tile import Tile
     from romnav.world.world import World
 
 EVALUATION_NOISE = 1
@@ -58,27 +61,55 @@ class Stages:
         """What makes the output of each kind of stage."""
         return {
             "encoder": self.encoder,
+            "quality": self.quality,
             "policy": self.policy,
             "episodes": self.episodes,
             "tables": self.tables,
         }
 
     def encoder(self, stage: Stage, progress: Progress) -> dict[str, Any]:
-        """Pretrains the LiDAR encoder."""
+        """Pretrains the encoder of a sensor."""
+        from romnav.sensing.encoder import load
         from romnav.sensing.pretrain import pretrain
 
         settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
-        pretrain(
-            settings.pretrain,
+        sensor = self._sensor(stage, settings, world.tiles)
+        path = pretrain(
+            getattr(settings, PRETRAINING[str(stage.sensor)]),
             list(zip(world.tiles, world.grids, strict=True)),
-            self._lidar(settings, world),
-            settings.lidar.height,
+            sensor,
+            sensor.spec.height,
             stage.folder,
             device=self.device,
             progress=progress,
             resume=self.resume,
         )
+        return {"digest": load(path).digest()}
+
+    def quality(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Measures and draws what an encoder makes of tiles that it was not trained on."""
+        from romnav.report.encoder_figure import draw_encoder
+        from romnav.sensing.encoder import load_autoencoder
+        from romnav.sensing.pretrain import quality
+        from romnav.world.tiles import generate
+
+        settings = cast(Scale, stage.settings)
+        spec = settings.quality
+        if spec.seed == settings.world.seed:
+            raise RomnavError(f"quality.seed: {spec.seed} is the training terrain's; set another one in the scale")
+        terrain = settings.world.model_copy(update={"seed": spec.seed})
+        tiles = []
+        for index in range(spec.tiles):
+            tiles.append(generate(terrain, index))
+            progress(index + 1, spec.tiles, "tiles")
+        sensor = self._sensor(stage, settings, [tile for tile, _ in tiles])
+        model = load_autoencoder(stage.upstream[0].folder / "encoder.pt", self.device)
+        corruption = getattr(settings, PRETRAINING[str(stage.sensor)]).corruption
+        judged = (model, tiles, sensor, sensor.spec.height, corruption)
+        measured = quality(*judged, images=spec.images, device=self.device)
+        files.write(stage.folder / "quality.json", json.dumps(measured, indent=2) + "\n")
+        draw_encoder(*judged, stage.folder / "encoder.png", device=self.device)
         return {}
 
     def policy(self, stage: Stage, progress: Progress) -> dict[str, Any]:
@@ -88,7 +119,7 @@ class Stages:
 
         settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
-        perception = self._perception(stage.upstream[0], settings, world, stage.seed or 0)
+        perception = self._perception(stage, settings, world, stage.seed or 0)
         path = train(
             settings.navigation,
             world,
@@ -115,12 +146,10 @@ class Stages:
         if stage.arm in SCRIPTED:
             driver: Any = rollout.SCRIPTED[stage.arm]()
         else:
-            encoder, trained = stage.upstream
-            perception = self._perception(encoder, settings, world, EVALUATION_NOISE)
+            trained = stage.upstream[-1]
+            perception = self._perception(trained, settings, world, EVALUATION_NOISE)
             policy = trained.folder / "policy.pt"
-            actor = checkpoint.load_actor(
-                policy, perception.encoder.token_shape, perception.encoder.digest(), self.device
-            )
+            actor = checkpoint.load_actor(policy, perception.encoder, self.device)
             driver = rollout.Policy(actor, perception)
             record = store.read(trained)
             facts = record.facts if record else facts
@@ -170,16 +199,28 @@ class Stages:
 
         return build(spec, self._worlds, progress)
 
-    def _perception(self, encoder: Stage, settings: Scale, world: World, seed: int) -> LidarPerception:
+    def _perception(self, policy: Stage, settings: Scale, world: World, noise: int) -> LidarPerception:
+        """What a policy sees: its pretrained encoder, or the random one that its training began with."""
         from romnav.navigation.perception import LidarPerception
         from romnav.sensing import encoder as encoders
         from romnav.sensing.corruption import Corruption
 
-        corruption = Corruption(settings.navigation.corruption, seed, self.device)
-        frozen = encoders.load(encoder.folder / "encoder.pt", settings.pretrain.encoder, self.device)
-        return LidarPerception(self._lidar(settings, world), corruption, frozen)
+        corruption = Corruption(settings.navigation.corruption, noise, self.device)
+        lidar, spec = self._lidar(settings, world.tiles), settings.pretrain.encoder
+        if policy.upstream:
+            encoder = encoders.load(policy.upstream[0].folder / "encoder.pt", spec, self.device)
+        else:
+            encoder = encoders.untrained(spec, lidar.directions, policy.seed or 0).encoder.to(self.device)
+        return LidarPerception(lidar, corruption, encoder.requires_grad_(False))
 
-    def _lidar(self, settings: Scale, world: World) -> Lidar:
+    def _lidar(self, settings: Scale, tiles: Sequence[Tile]) -> Lidar:
         from romnav.sensing.lidar import Lidar
 
-        return Lidar([tile.solids for tile in world.tiles], settings.lidar, self.device)
+        return Lidar([tile.solids for tile in tiles], settings.lidar, self.device)
+
+    def _sensor(self, stage: Stage, settings: Scale, tiles: Sequence[Tile]) -> Lidar | DepthCamera:
+        if stage.sensor == "lidar":
+            return self._lidar(settings, tiles)
+        from romnav.sensing.depth import DepthCamera
+
+        return DepthCamera([tile.solids for tile in tiles], settings.depth, self.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import pickle
 import zipfile
@@ -18,6 +19,7 @@ from romnav.navigation.env import STATE_SIZE
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import NavigationSpec
+from romnav.sensing.encoder import Encoder
 
 FORMAT = "romnav-policy-1"
 TORN = (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
@@ -48,22 +50,29 @@ def read(path: Path, device: str = "cpu") -> dict[str, Any]:
     return content
 
 
-def load_actor(path: Path, tokens: tuple[int, int], encoder: str, device: str = "cpu") -> NavigationActor:
-    """The policy of ``path`` for ``tokens`` (K, C) of the encoder with digest ``encoder``, in evaluation mode.
+def load_actor(path: Path, encoder: Encoder, device: str = "cpu") -> NavigationActor:
+    """The policy of ``path`` for the tokens of ``encoder``, in evaluation mode.
+
+    One that trained its encoder has a copy of ``encoder`` with its own weights.
 
     Raises:
         RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec.
     """
     content = read(path, device)
-    if content["encoder"] != encoder:
+    own = any(name.startswith("encoder.") for name in content["actor"])
+    if content["encoder"] != encoder.digest() and not own:
         raise RomnavError(
-            f"{path}: key 'encoder' is {content['encoder']}, but the encoder at hand is {encoder}; "
+            f"{path}: key 'encoder' is {content['encoder']}, but the encoder at hand is {encoder.digest()}; "
             "train the arm again or restore the encoder it was trained with"
         )
     try:
         spec = NavigationSpec.model_validate_json(content["spec"])
-        obs = TensorDict({"lidar": torch.zeros(1, *tokens), "state": torch.zeros(1, STATE_SIZE)}, batch_size=[1])
+        obs = TensorDict(
+            {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, STATE_SIZE)}, batch_size=[1]
+        )
         actor = make_actor(obs, spec.policy)
+        if own:
+            actor.encoder = copy.deepcopy(encoder)
         actor.load_state_dict(content["actor"])
     except (RuntimeError, ValidationError) as error:
         reason = str(error).splitlines()[1].strip()

@@ -11,19 +11,21 @@ from romnav.sensing.lidar import Lidar
 
 
 class LidarPerception:
-    """Tokens of what the LiDAR sees from robots standing at given poses.
+    """What the LiDAR sees from robots standing at given poses: tokens of a frozen encoder, or images.
 
-    Rollouts keep tokens in bfloat16, never images: the encoder is frozen, so its output is all that learning needs.
+    While the encoder is frozen, rollouts keep tokens in bfloat16, never images: they are all that learning needs.
     """
 
     def __init__(self, lidar: Lidar, corruption: Corruption, encoder: Encoder) -> None:
         self.lidar = lidar
         self.corruption = corruption
         self.encoder = encoder
+        self.images = False
+        """Whether to yield images, for a policy that has an encoder of its own."""
         self._mount = torch.tensor([0.0, 0.0, lidar.spec.height], device=encoder.directions.device)
 
     def __call__(self, tile: Tensor, position: Tensor, yaw: Tensor, counters: Tensor) -> Tensor:
-        """(E, K, C) bfloat16 tokens.
+        """(E, K, C) bfloat16 tokens, or (E, rows, columns) float16 images in m, 8 mm exact at 16 m.
 
         Args:
             tile: (E,) int.
@@ -33,4 +35,4 @@ class LidarPerception:
         """
         ranges = self.lidar.scan(tile.to(torch.int32), position + self._mount, yaw)
         ranges = self.corruption(ranges, counters[:, 0], counters[:, 1])
-        return self.encoder.tokens(ranges).to(torch.bfloat16)
+        return ranges.half() if self.images else self.encoder.tokens(ranges).to(torch.bfloat16)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from romnav.navigation.attention import Attend
 from romnav.navigation.spec import PolicySpec
+from romnav.sensing.encoder import Encoder
 
 LAYERS = 2
 STATE_SCALE = (0.1, 0.1, 1.0, 0.25, 1.0, 1.0, 1.0, 4.0, 1.0)
@@ -132,7 +133,7 @@ class Attention(nn.Module):
 
 
 class NavigationActor(MLPModel):
-    """rsl-rl actor: attention over frozen LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
+    """rsl-rl actor: attention over LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
 
     In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts.
     """
@@ -163,6 +164,8 @@ class NavigationActor(MLPModel):
         self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim, embedding), nn.ELU())
         self.attention = Attention(tokens, channels, embedding, spec)
         self.core = RecurrentCore(visual + embedding, spec.recurrent)
+        self.encoder: Encoder | None = None
+        """Encoder of its own; then "lidar" are images (B, rows, columns) in m, otherwise tokens of a frozen one."""
         self._hidden: Tensor | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
@@ -170,7 +173,8 @@ class NavigationActor(MLPModel):
         single = masks is None
         lead = obs["state"].shape[:-1]
         state = self.state_embedding(obs["state"].flatten(0, -2) * self.scale)
-        tokens = obs["lidar"].flatten(0, -3).to(state.dtype)
+        lidar = obs["lidar"].flatten(0, -3).to(state.dtype)
+        tokens = lidar if self.encoder is None else self.encoder(lidar)
         seen = torch.cat([self.attention(tokens, state), state], dim=1).unflatten(0, lead)
         if single:
             hidden = self._hidden_for(lead[0], seen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Generator
 from itertools import chain
 from typing import Any
@@ -17,6 +18,7 @@ from torch import Tensor
 from romnav.navigation.env import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
 from romnav.navigation.spec import PolicySpec, PPOSpec
+from romnav.sensing.encoder import Encoder
 
 
 class Rollout(RolloutStorage):
@@ -69,6 +71,7 @@ class BoundedPPO(PPO):
     """PPO whose adaptive learning rate stays within bounds."""
 
     learning_rate_range = (0.0, float("inf"))
+    storage: RolloutStorage
 
     @property
     def learning_rate(self) -> float:
@@ -79,6 +82,15 @@ class BoundedPPO(PPO):
     def learning_rate(self, value: float) -> None:
         low, high = self.learning_rate_range
         self._learning_rate = min(max(value, low), high)
+
+    def unfreeze(self, encoder: Encoder, obs: TensorDict) -> None:
+        """Train a copy of ``encoder`` with the policy from the next rollout on; ``obs`` now holds images."""
+        self.actor.encoder = copy.deepcopy(encoder)
+        used = [*self.actor.encoder.trunk.parameters(), *self.actor.encoder.mean.parameters()]
+        self.optimizer.add_param_group({"params": [p.requires_grad_() for p in used], "lr": self.learning_rate})
+        self.storage = Rollout(
+            "rl", self.storage.num_envs, self.storage.num_transitions_per_env, obs, [ACTIONS], self.device
+        )
 
 
 def make_actor(obs: TensorDict, policy: PolicySpec) -> NavigationActor:

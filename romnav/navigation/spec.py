@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import Field
+
 from romnav.config import Config
 from romnav.sensing.spec import CorruptionSpec
 from romnav.world.spec import SamplerSpec
@@ -94,6 +96,16 @@ class PolicySpec(Config):
     """Hidden widths of the privileged critic (A)."""
 
 
+class EncoderUseSpec(Config):
+    """What becomes of the LiDAR encoder in reinforcement learning (paper, Sec. IV-B, "Pretrained Encoders")."""
+
+    pretrained: bool = True
+    """Whether it starts from the pretrained weights (P) or, as the paper's No Pretraining, from random ones."""
+    unfreeze_at: float = Field(default=1.0, ge=0.0, le=1.0)
+    """Share of the run after which PPO trains it as well; 1 is never (P: the paper's ablation has 1000 of 2000
+    iterations)."""
+
+
 class PPOSpec(Config):
     """PPO (Schulman et al., 2017) as rsl-rl implements it."""
 
@@ -136,6 +148,7 @@ class NavigationSpec(Config):
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""
+    encoder: EncoderUseSpec = EncoderUseSpec()
     env: EnvSpec = EnvSpec()
     policy: PolicySpec = PolicySpec()
     ppo: PPOSpec = PPOSpec()

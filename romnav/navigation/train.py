@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 from romnav import files
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
 from romnav.navigation.perception import LidarPerception
-from romnav.navigation.ppo import make_ppo
+from romnav.navigation.ppo import BoundedPPO, make_ppo
 from romnav.navigation.spec import NavigationSpec
 from romnav.robot.rom import ReducedOrderModel
 from romnav.threads import torch_threads
@@ -65,22 +66,30 @@ def _train(
     torch.manual_seed(seed)
     world = world.to(device)
     dynamics = ReducedOrderModel(world, spec.env.envs, spec.env.period)
+    perception.images = False
     env = NavigationEnv(world, dynamics, perception, spec.env, seed, device)
     obs = env.get_observations()
     ppo = make_ppo(obs, spec.policy, spec.ppo, spec.env.envs, device)
     identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
+    total = spec.ppo.iterations
+    unfreeze_at = round(spec.encoder.unfreeze_at * total)
     state = out / "checkpoint.pt"
     done, seconds, curve = 0, 0.0, []
     if resume and state.exists():
-        saved = _restore(state, identity, ppo, env, device)
+        saved = checkpoint.read(state, device)
+        if saved["iterations"] > unfreeze_at:
+            _unfreeze(ppo, env, perception)
+        _restore(state, saved, identity, ppo, env)
         done, seconds, curve = saved["iterations"], saved["seconds"], saved["curve"]
         obs = env.get_observations()
     ppo.train_mode()
     saved_at = started = time.monotonic()
-    before = seconds
-    total = spec.ppo.iterations
+    before, cpu_before = seconds, curve[-1]["cpu_seconds"] if curve else 0.0
+    cpu_started = time.process_time()
     steps = spec.env.envs * spec.ppo.steps
     while done < total:
+        if done == unfreeze_at:
+            obs = _unfreeze(ppo, env, perception)
         env.progress = done / total
         with torch.inference_mode():
             for _ in range(spec.ppo.steps):
@@ -90,7 +99,8 @@ def _train(
         losses = ppo.update()
         done += 1
         seconds = before + time.monotonic() - started
-        curve.append(_row(done, done * steps, seconds, env, losses, ppo.learning_rate))
+        cpu_seconds = cpu_before + time.process_time() - cpu_started
+        curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate))
         if progress:
             progress(done * steps, total * steps, _summary(curve))
         if time.monotonic() - saved_at > SAVE_EVERY and done < total:
@@ -121,8 +131,17 @@ def _save(
     _write_curve(path.with_name("curve.csv"), curve)
 
 
-def _restore(path: Path, identity: dict[str, Any], ppo: Any, env: NavigationEnv, device: str) -> dict[str, Any]:
-    content = checkpoint.read(path, device)
+def _unfreeze(ppo: BoundedPPO, env: NavigationEnv, perception: LidarPerception) -> TensorDict:
+    """Let PPO train the encoder as well; returns the present observations, with images."""
+    perception.images = True
+    obs = env.get_observations()
+    ppo.unfreeze(perception.encoder, obs)
+    return obs
+
+
+def _restore(
+    path: Path, content: dict[str, Any], identity: dict[str, Any], ppo: BoundedPPO, env: NavigationEnv
+) -> None:
     for key, value in identity.items():
         if content.get(key) != value:
             raise RomnavError(
@@ -132,14 +151,20 @@ def _restore(path: Path, identity: dict[str, Any], ppo: Any, env: NavigationEnv,
     ppo.actor.reset(hidden_state=content["memory"])
     env.load_state_dict(content["env"])
     torch.set_rng_state(content["random"].cpu())
-    return content
 
 
 def _row(
-    done: int, steps: int, seconds: float, env: NavigationEnv, losses: dict[str, float], rate: float
+    done: int,
+    steps: int,
+    seconds: float,
+    cpu_seconds: float,
+    env: NavigationEnv,
+    losses: dict[str, float],
+    rate: float,
 ) -> dict[str, float]:
     s = env.statistics()
-    row: dict[str, float] = {"iteration": done, "steps": steps, "seconds": round(seconds, 2)}
+    row: dict[str, float] = {"iteration": done, "steps": steps}
+    row |= {"seconds": round(seconds, 2), "cpu_seconds": round(cpu_seconds, 2)}
     row |= {"episodes": s.episodes, "success": s.success, "same": s.same, "cross": s.cross}
     row |= {f"reward_{name}": value for name, value in s.reward.items()}
     row |= {f"loss_{name}": value for name, value in losses.items()}

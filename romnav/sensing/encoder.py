@@ -83,18 +83,18 @@ class Encoder(nn.Module):
         return self.mean(features), self.log_variance(features)
 
     def forward(self, ranges: Tensor) -> Tensor:
-        """(B, tokens, channels) posterior means of ``ranges`` (B, rows, columns) in m, with gradients."""
-        return self._tokens(self.image(ranges))
+        """(B, tokens, channels) float32 posterior means of ``ranges`` (B, rows, columns) in m, with gradients.
 
-    def _tokens(self, image: Tensor) -> Tensor:
-        return self.mean(self.trunk(image)).flatten(2).transpose(1, 2)
+        Computed in bfloat16 if the spec says so.
+        """
+        image = self.image(ranges, torch.bfloat16 if self.spec.bfloat16 else torch.float32)
+        with torch.autocast(ranges.device.type, torch.bfloat16, enabled=self.spec.bfloat16):
+            return self.mean(self.trunk(image)).flatten(2).transpose(1, 2).float()
 
     @torch.no_grad()
     def tokens(self, ranges: Tensor) -> Tensor:
-        """The same without gradients, computed in bfloat16 if the spec says so; float32."""
-        image = self.image(ranges, torch.bfloat16 if self.spec.bfloat16 else torch.float32)
-        with torch.autocast(ranges.device.type, torch.bfloat16, enabled=self.spec.bfloat16):
-            return self._tokens(image).float()
+        """The same without gradients."""
+        return self(ranges)
 
     def digest(self) -> str:
         """Fingerprint of architecture and weights, by which a policy names its encoder."""
@@ -159,6 +159,13 @@ class Autoencoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
+def untrained(spec: EncoderSpec, directions: Tensor, seed: int) -> Autoencoder:
+    """Encoder and decoder with the random weights of ``seed``."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return Autoencoder(spec, directions)
+
+
 def save(path: Path, model: Autoencoder, extra: dict[str, Any] | None = None) -> None:
     """Write a checkpoint in one step; ``extra`` is whatever its writer needs to go on."""
     buffer = io.BytesIO()
@@ -219,9 +226,8 @@ def load(path: Path, spec: EncoderSpec | None = None, device: str = "cpu") -> En
         RomnavError: As `load_autoencoder`, or the checkpoint is of another architecture than ``spec``.
     """
     encoder = load_autoencoder(path, device).encoder
-    if spec is not None and encoder.spec != spec:
-        mine, theirs = spec.model_dump(), encoder.spec.model_dump()
-        key = next(k for k in mine if mine[k] != theirs[k])
+    mine, theirs = spec.model_dump() if spec else {}, encoder.spec.model_dump()
+    for key in (k for k in mine if mine[k] != theirs[k]):
         raise RomnavError(
             f"{path}: key 'encoder.{key}' is {theirs[key]} in the checkpoint but {mine[key]} in the spec; "
             f"change the spec or {AGAIN}"

@@ -8,9 +8,7 @@ import hashlib
 import io
 import math
 import operator
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,14 +25,13 @@ from romnav.sensing import encoder as checkpoints
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.spec import CorruptionSpec, PretrainSpec
+from romnav.threads import torch_threads
 from romnav.world.grids import Grids
 from romnav.world.solids import Label
 from romnav.world.tile import Tile
 
 NEAR = 2.0
 """Nodes this near to a stair or ramp are oversampled, m (A: both mouths and the approach to them)."""
-SHARDS = 2
-"""Parts of a batch, each on one thread; their gradients are summed in order: no thread count changes a bit."""
 WARM_UP = 25
 """Gradient steps over which the learning rate rises."""
 LOG_INTERVAL = 25
@@ -170,9 +167,10 @@ def pretrain(
     state = _Training(spec, sensor, poses, key, device)
     if resume and state_path.exists():
         state.restore(state_path)
-    with _one_thread() as threads, ThreadPoolExecutor(threads) as pool:
+    # batches are small: a second thread gains nothing, and another number of threads gives other bits
+    with torch_threads(1):
         while state.step < state.steps:
-            text = state.advance(pool)
+            text = state.advance()
             done = min(state.step * spec.batch, spec.images * spec.epochs)
             progress(done, spec.images * spec.epochs, text)
             if state.step % CHECKPOINT_INTERVAL == 0 and state.step < state.steps:
@@ -188,9 +186,7 @@ class _Training:
 
     def __init__(self, spec: PretrainSpec, sensor: Sensor, poses: Poses, key: str, device: str) -> None:
         self._spec, self._sensor, self._poses, self._key, self._device = spec, sensor, poses, key, device
-        with torch.random.fork_rng():
-            torch.manual_seed(spec.seed)
-            self.model = Autoencoder(spec.encoder, sensor.directions).to(device)
+        self.model = checkpoints.untrained(spec.encoder, sensor.directions, spec.seed).to(device)
         self._parameters = list(self.model.parameters())
         self._optimizer = torch.optim.AdamW(
             self._parameters, spec.learning_rate, weight_decay=spec.weight_decay, foreach=True
@@ -202,19 +198,17 @@ class _Training:
         self._rows: list[list[float]] = []
         self._recent = torch.zeros(len(TERMS), dtype=torch.float64)
 
-    def advance(self, pool: ThreadPoolExecutor) -> str:
+    def advance(self) -> str:
         """One gradient step; returns what to show of it."""
         spec = self._spec
-        epoch, position = divmod(self.step, self._per_epoch)
-        index = torch.arange(position * spec.batch, (position + 1) * spec.batch, device=self._device)
-        parts = list(pool.map(lambda k: self._gradients(index[k::SHARDS], epoch, k), range(SHARDS)))
         rate = spec.learning_rate * min(1.0, (self.step + 1) / WARM_UP, 4.0 * (1.0 - self.step / self.steps))
         for group in self._optimizer.param_groups:
             group["lr"] = rate
-        for i, parameter in enumerate(self._parameters):
-            parameter.grad = sum((p[1][i] for p in parts[1:]), parts[0][1][i]) / SHARDS
+        terms = self._terms()
+        self._optimizer.zero_grad()
+        terms.sum().backward()
         self._optimizer.step()
-        terms = torch.stack([p[0] for p in parts]).mean(0)
+        terms = terms.detach().double().cpu()
         self._recent += terms
         self.step += 1
         if self.step % LOG_INTERVAL == 0 or self.step == self.steps:
@@ -223,16 +217,17 @@ class _Training:
             self._recent.zero_()
         return f"loss {terms.sum():.1f} nat"
 
-    def _gradients(self, index: Tensor, epoch: int, shard: int) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def _terms(self) -> Tensor:
+        """(terms,) of the loss of the next batch, in the order of `TERMS`."""
         spec = self._spec
+        epoch, position = divmod(self.step, self._per_epoch)
+        index = torch.arange(position * spec.batch, (position + 1) * spec.batch, device=self._device)
         tile, origin, yaw = self._poses(index)
         clean, labels = self._sensor.scan(tile, origin, yaw, labels=True)
         seen = self._corrupt(clean, index, torch.full_like(index, epoch))
-        seed = int(random.bits(spec.seed, self.step, shard))
-        generator = torch.Generator(self._device).manual_seed(seed)
+        generator = torch.Generator(self._device).manual_seed(int(random.bits(spec.seed, self.step)))
         terms = loss_terms(self.model, spec, seen, clean, labels, generator)
-        total = torch.stack([terms[name] for name in TERMS])
-        return total.detach().double().cpu(), torch.autograd.grad(total.sum(), self._parameters)
+        return torch.stack([terms[name] for name in TERMS])
 
     def save(self, path: Path) -> None:
         extra = {
@@ -271,17 +266,6 @@ def _key(spec: PretrainSpec, sensor: Sensor, poses: Poses) -> str:
     for tensor in (sensor.directions, sensor.scan(tile, origin, yaw)):
         digest.update(tensor.cpu().numpy().tobytes())
     return digest.hexdigest()[:16]
-
-
-@contextmanager
-def _one_thread() -> Iterator[int]:
-    """Runs every operator on its caller's thread; yields how many threads there were."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield threads
-    finally:
-        torch.set_num_threads(threads)
 
 
 @torch.no_grad()

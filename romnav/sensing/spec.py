@@ -115,13 +115,44 @@ class PretrainSpec(Config):
     """Seed of weights, poses and corruption."""
 
 
-DEPTH_PRETRAIN = PretrainSpec(
-    encoder=EncoderSpec(cartesian=False, scale=2.0, widths=(16, 32, 64, 64), strides=((2, 2),) * 4),
-    corruption=CorruptionSpec(noise=(0.002, 0.0, 0.004), occlusion=((0.15, 0.85, 0.88, 1.0),)),
-    sigma=0.2,
-)
-"""Training of the depth camera's encoder.
+class DepthCorruptionSpec(CorruptionSpec):
+    """What is done to clean depth images."""
 
-Stereo noise grows with the square of depth: 0.2 pixels of disparity at 63 mm baseline and 700 pixels focal length (A);
-the chest hides the lower edge of the image (A).
-"""
+    noise: tuple[float, float, float] = (0.002, 0.0, 0.004)
+    """Standard deviation of a depth z, ``n0 + n1 z + n2 z^2``, m (A: 0.2 pixels of disparity at 63 mm baseline and
+    700 pixels focal length)."""
+    occlusion: tuple[tuple[float, float, float, float], ...] = ((0.15, 0.85, 0.88, 1.0),)
+    """Boxes (left, right, top, bottom), shares of the image (A: the chest hides its lower edge)."""
+
+
+class DepthEncoderSpec(EncoderSpec):
+    """Variational autoencoder of the depth camera."""
+
+    cartesian: bool = False
+    """Depth and validity alone (P)."""
+    scale: float = Field(default=2.0, gt=0.0)
+    """Length that becomes 1 in the channel and head, m (A)."""
+    strides: tuple[tuple[int, int], ...] = ((2, 2), (2, 2), (2, 2), (2, 2))
+    """Rows and columns merged by each stage; 26 x 30 pixels become 2 x 2 tokens (A)."""
+
+
+class DepthPretrainSpec(PretrainSpec):
+    """Training of the depth camera's encoder."""
+
+    encoder: DepthEncoderSpec = DepthEncoderSpec()
+    """Network."""
+    corruption: DepthCorruptionSpec = DepthCorruptionSpec()
+    """What is done to the inputs; targets stay clean."""
+    sigma: float = Field(default=0.2, gt=0.0)
+    """Deviation of the likelihood behind the squared errors, m (A: the ground is near)."""
+
+
+class QualitySpec(Config):
+    """Judging an encoder on tiles that it was not trained on."""
+
+    images: int = Field(default=4096, ge=1)
+    """Images, posed as in training (A: a per-mille of a class moves its IoU by less than the seed does)."""
+    tiles: int = Field(default=64, ge=1)
+    """Tiles (A)."""
+    seed: int = 1000
+    """Seed of the tiles; training uses another (P)."""

@@ -38,6 +38,13 @@ def policy() -> Policy:
     return Policy(make_actor(obs, PolicySpec(attention=16, recurrent=16)), FakePerception())
 
 
+def test_a_policy_with_its_own_encoder_is_shown_images() -> None:
+    driver = policy()
+    assert not driver.perception.images
+    driver.actor.encoder = driver.perception.encoder
+    assert Policy(driver.actor, driver.perception).perception.images
+
+
 def test_oracle_reaches_nearly_every_goal_by_nearly_the_shortest_path(world: World, paired: EpisodeSet) -> None:
     out = evaluate(Oracle(), world, paired, EnvSpec(), EvaluationSpec())
     success = out["outcome"] == "success"

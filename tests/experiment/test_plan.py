@@ -81,6 +81,40 @@ def test_an_arm_that_changes_the_encoder_gets_its_own(tmp_path: Path) -> None:
     assert own.folder.parent == here.encoder().folder.parent
 
 
+def test_an_arm_without_pretraining_needs_no_encoder(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    arm = 'kind = "ablation"\ntitle = "t"\ntables = []\n[arms.own]\nlabel = "Own"\n'
+    arm += "navigation.encoder.pretrained = false\n"
+    here.project.file("more").write_text(arm)
+    own = here.policy("own", 0)
+    assert own.upstream == ()
+    wider = Plan(Project(tmp_path, tmp_path / "results"), here.scale)
+    wider.project.file("more").write_text(arm + "pretrain.encoder.latent = 16\npretrain.epochs = 3\n")
+    assert wider.policy("own", 0).key != own.key
+    wider.project.file("more").write_text(arm + "pretrain.epochs = 3\n")
+    assert Plan(Project(tmp_path, tmp_path / "results"), here.scale).policy("own", 0).key == own.key
+
+
+@pytest.mark.parametrize(
+    ("section", "change", "rerun"),
+    [
+        ("quality", "images = 9", {"quality of encoder lidar", "quality of encoder depth"}),
+        ("depth", "rows = 9", {"encoder depth", "quality of encoder depth"}),
+        ("pretrain_depth.encoder", "latent = 9", {"encoder depth", "quality of encoder depth"}),
+        ("pretrain", "epochs = 9", {"encoder lidar", "quality of encoder lidar"}),
+    ],
+)
+def test_an_encoder_is_judged_apart_from_its_training(
+    tmp_path: Path, section: str, change: str, rerun: set[str]
+) -> None:
+    def keys(scale: str) -> dict[str, str]:
+        here = plan(tmp_path, scale)
+        return everything(here.quality("lidar")) | everything(here.quality("depth"))
+
+    before, after = keys(SCALE), keys(f"{SCALE}[{section}]\n{change}\n")
+    assert {name for name in before if before[name] != after[name]} == rerun
+
+
 def test_seeds_are_trained_apart_and_share_the_scripted_arms(tmp_path: Path) -> None:
     names = everything(plan(tmp_path).tables("spawn-goal", [0, 1])).keys()
     assert {"policy rom, seed 0", "policy rom, seed 1"} <= names

@@ -7,28 +7,33 @@ import torch
 from torch import Tensor
 
 from romnav.navigation.spec import EnvSpec, NavigationSpec, PolicySpec, PPOSpec
+from romnav.sensing.encoder import Encoder, untrained
+from romnav.sensing.spec import EncoderSpec
 from romnav.world.spec import WorldSpec
 from romnav.world.world import World, build
 
 TOKENS = (4, 8)
 
 
-class FakeEncoder:
-    """Names itself as an encoder does."""
-
-    def digest(self) -> str:
-        return "fake"
+def fake_encoder(latent: int = TOKENS[1]) -> Encoder:
+    """Random weights on images of 4 x 8 pixels."""
+    directions = torch.nn.functional.normalize(torch.linspace(-1, 1, 96).sin().view(4, 8, 3) + 0.1, dim=2)
+    spec = EncoderSpec(widths=(8,), strides=((2, 4),), latent=latent)
+    return untrained(spec, directions, 0).encoder.requires_grad_(False)
 
 
 class FakePerception:
-    """Tokens that are a smooth function of pose and counters, in place of LiDAR and encoder."""
+    """Images that are a smooth function of pose and counters, in place of the LiDAR's."""
 
-    encoder = FakeEncoder()
+    def __init__(self) -> None:
+        self.encoder = fake_encoder()
+        self.images = False
 
     def __call__(self, tile: Tensor, position: Tensor, yaw: Tensor, counters: Tensor) -> Tensor:
-        phase = torch.arange(TOKENS[0] * TOKENS[1]) * 0.37
+        phase = torch.arange(32) * 0.37
         sums = position.sum(dim=1) + yaw + tile + counters[:, 0] + 0.1 * counters[:, 1]
-        return torch.sin(sums[:, None] + phase).view(-1, *TOKENS).to(torch.bfloat16)
+        ranges = 2.5 + 2.0 * torch.sin(sums[:, None] + phase).view(-1, 4, 8)
+        return ranges.half() if self.images else self.encoder.tokens(ranges).to(torch.bfloat16)
 
 
 @pytest.fixture(scope="session")

@@ -9,14 +9,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint, train
+from romnav.navigation.env import STATE_SIZE
+from romnav.navigation.ppo import make_actor
 from romnav.navigation.rewards import TERMS
-from romnav.navigation.spec import NavigationSpec, RewardSpec
+from romnav.navigation.spec import EncoderUseSpec, NavigationSpec, RewardSpec
 from romnav.world.world import World
 
-from .conftest import TOKENS
+from .conftest import TOKENS, FakePerception, fake_encoder
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
@@ -87,11 +90,83 @@ def test_killed_and_resumed_equals_left_alone(
     assert_same(weights(tmp_path / "whole"), weights(tmp_path / "killed"))
     assert not (tmp_path / "killed" / "checkpoint.pt").exists()
     curves = [
-        [{**row, "seconds": ""} for row in csv.DictReader((tmp_path / name / "curve.csv").open())]
+        [{**row, "seconds": "", "cpu_seconds": ""} for row in csv.DictReader((tmp_path / name / "curve.csv").open())]
         for name in ("whole", "killed")
     ]
     assert curves[0] == curves[1]
     assert len(curves[0]) == spec.ppo.iterations
+
+
+def unfreezing(spec: NavigationSpec, share: float) -> NavigationSpec:
+    return spec.model_copy(update={"encoder": EncoderUseSpec(unfreeze_at=share)})
+
+
+def test_the_encoder_is_trained_from_its_iteration_on(world: World, spec: NavigationSpec, tmp_path: Path) -> None:
+    """Until then the run is that of the frozen arm, bit for bit, and keeps no images."""
+    perception = FakePerception()
+    kept = []
+
+    def progress(done: int, total: int, metric: str) -> None:
+        kept.append(perception.images)
+
+    train.train(spec, world, FakePerception(), tmp_path / "frozen", 1)
+    train.train(unfreezing(spec, 0.5), world, perception, tmp_path / "own", 1, progress=progress)
+    assert kept == [False, False, True, True]
+    frozen, own = (
+        [{**row, "seconds": "", "cpu_seconds": ""} for row in csv.DictReader((tmp_path / name / "curve.csv").open())]
+        for name in ("frozen", "own")
+    )
+    assert frozen[:2] == own[:2]
+    assert frozen[3] != own[3]
+    found = {k: v for k, v in weights(tmp_path / "own").items() if k.startswith("encoder.")}
+    before = fake_encoder().state_dict()
+    changed = {k for k in before if not torch.equal(before[k], found[f"encoder.{k}"])}
+    assert changed == {f"{part}.{kind}" for part in ("trunk.0", "mean") for kind in ("weight", "bias")}
+    assert perception.encoder.digest() == fake_encoder().digest()
+    assert not any(k.startswith("encoder.") for k in weights(tmp_path / "frozen"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.75], ids=["from the start", "before", "at", "after the stop"])
+def test_resuming_across_the_switch_is_exact(
+    share: float, world: World, spec: NavigationSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "SAVE_EVERY", 0.0)
+    spec = unfreezing(spec, share)
+
+    class Stop(Exception):
+        pass
+
+    def stop(done: int, total: int, metric: str) -> None:
+        if done == 3 * total // 4:
+            raise Stop
+
+    train.train(spec, world, FakePerception(), tmp_path / "whole", 1)
+    with pytest.raises(Stop):
+        train.train(spec, world, FakePerception(), tmp_path / "stopped", 1, progress=stop)
+    assert checkpoint.read(tmp_path / "stopped" / "checkpoint.pt")["iterations"] == 2
+    train.train(spec, world, FakePerception(), tmp_path / "stopped", 1)
+    assert_same(weights(tmp_path / "whole"), weights(tmp_path / "stopped"))
+
+
+def test_a_policy_with_its_own_encoder_carries_and_uses_it(world: World, spec: NavigationSpec, tmp_path: Path) -> None:
+    perception = FakePerception()
+    path = train.train(unfreezing(spec, 0.0), world, perception, tmp_path, 1)
+    actor = checkpoint.load_actor(path, perception.encoder)
+    assert actor.encoder is not None
+    assert_same(dict(actor.state_dict()), weights(tmp_path))
+    perception.images = True
+    torch.manual_seed(0)
+    pose = (torch.arange(5), torch.rand(5, 3), torch.rand(5), torch.zeros(5, 2))
+    images, state = perception(*pose), torch.rand(5, STATE_SIZE)
+    mine = actor(TensorDict({"lidar": images, "state": state}, batch_size=[5]))
+    template = TensorDict({"lidar": torch.zeros(1, *TOKENS), "state": state[:1]}, batch_size=[1])
+    frozen = make_actor(template, spec.policy)
+    frozen.load_state_dict({k: v for k, v in weights(tmp_path).items() if not k.startswith("encoder.")})
+    seen = {"own": actor.encoder.tokens(images.float()), "pretrained": perception.encoder.tokens(images.float())}
+    obs = {name: TensorDict({"lidar": tokens, "state": state}, batch_size=[5]) for name, tokens in seen.items()}
+    torch.testing.assert_close(frozen(obs["own"]), mine)
+    frozen.reset()
+    assert not torch.allclose(frozen(obs["pretrained"]), mine, atol=1e-4)
 
 
 def test_learning_rate_stays_in_bounds(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
@@ -141,11 +216,14 @@ def test_policy_errors_name_file_and_fix(
     world: World, perception: object, spec: NavigationSpec, tmp_path: Path
 ) -> None:
     path = train.train(spec, world, perception, tmp_path, 1)
-    assert checkpoint.load_actor(path, TOKENS, "fake")
-    with pytest.raises(RomnavError, match="key 'encoder' is fake, but the encoder at hand is other"):
-        checkpoint.load_actor(path, TOKENS, "other")
-    with pytest.raises(RomnavError, match=r"policy\.pt: a policy of another architecture .*attention\.place"):
-        checkpoint.load_actor(path, (TOKENS[0] + 1, TOKENS[1]), "fake")
+    encoder, other = fake_encoder(), fake_encoder(latent=9)
+    assert checkpoint.load_actor(path, encoder)
+    digests = f"{encoder.digest()}, but the encoder at hand is {other.digest()}"
+    with pytest.raises(RomnavError, match=f"key 'encoder' is {digests}; train the arm again"):
+        checkpoint.load_actor(path, other)
+    checkpoint.save(tmp_path / "renamed.pt", {**checkpoint.read(path), "encoder": other.digest()})
+    with pytest.raises(RomnavError, match=r"renamed\.pt: a policy of another architecture .*attention\.embed"):
+        checkpoint.load_actor(tmp_path / "renamed.pt", other)
     with pytest.raises(RomnavError, match=r"none\.pt: no such policy; train it"):
         checkpoint.read(tmp_path / "none.pt")
     content = path.read_bytes()

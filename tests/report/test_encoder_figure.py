@@ -11,7 +11,7 @@ from romnav.report.encoder_figure import TITLES, draw_encoder
 from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.lidar import Lidar
-from romnav.sensing.spec import DEPTH_PRETRAIN, CorruptionSpec, DepthSpec, EncoderSpec, LidarSpec
+from romnav.sensing.spec import CorruptionSpec, DepthEncoderSpec, DepthSpec, EncoderSpec, LidarSpec
 from romnav.world.grids import rasterise
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import GridSpec
@@ -31,7 +31,7 @@ def test_a_row_of_panels_per_tile_class_and_share(sensor_name: str, tmp_path: Pa
     if sensor_name == "lidar":
         sensor, spec = Lidar(solids, LidarSpec(rows=15, columns=55)), EncoderSpec()
     else:
-        sensor, spec = DepthCamera(solids, DepthSpec()), DEPTH_PRETRAIN.encoder
+        sensor, spec = DepthCamera(solids, DepthSpec()), DepthEncoderSpec()
     path = tmp_path / "encoder.png"
     draw_encoder(Autoencoder(spec, sensor.directions), tiles, sensor, 1.2, CorruptionSpec(), path)
     height, width, _ = matplotlib.image.imread(path).shape

@@ -14,7 +14,7 @@ from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.lidar import Lidar
 from romnav.sensing.pretrain import TERMS, Poses, divergence, loss_terms, pretrain, quality
-from romnav.sensing.spec import DEPTH_PRETRAIN, CorruptionSpec, DepthSpec, EncoderSpec, LidarSpec, PretrainSpec
+from romnav.sensing.spec import CorruptionSpec, DepthPretrainSpec, DepthSpec, EncoderSpec, LidarSpec, PretrainSpec
 from romnav.world.grids import Grids, rasterise
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import GridSpec
@@ -214,7 +214,7 @@ def test_quality_of_a_known_model(tiles: list[tuple[Tile, Grids]], lidar: Lidar)
 
 def test_the_depth_camera_learns_by_the_same_code(tiles: list[tuple[Tile, Grids]], tmp_path: Path) -> None:
     camera = DepthCamera([tile.solids for tile, _ in tiles], DepthSpec())
-    spec = DEPTH_PRETRAIN.model_copy(update={"images": 128, "epochs": 1})
+    spec = DepthPretrainSpec(images=128, epochs=1)
     model = checkpoints.load_autoencoder(pretrain(spec, tiles, camera, HEIGHT, tmp_path))
     assert model.encoder.token_shape == (4, 32)
     found = quality(model, tiles, camera, HEIGHT, spec.corruption, images=64)
