@@ -107,21 +107,22 @@ def ablation(
     device: DeviceOption = "cpu",
     resume: ResumeOption = True,
 ) -> None:
-    """Train and evaluate every arm of an ablation, then write and print its tables."""
+    """Train every arm of an ablation, evaluate them if it has tables of episodes, then write and print its tables."""
     from romnav.experiment.launch import stages_side_by_side
     from romnav.experiment.run import EVERYTHING
 
     plan = _plan(ctx, scale)
     seeds = plan.project.experiment(name).seeds if seed is None else (seed,)
-    tables = plan.tables(name, seeds)
-    stages = _pending([tables], resume, EVERYTHING)
+    reports = plan.reports(name, seeds)
+    stages = _pending(reports, resume, EVERYTHING)
     if device == "cpu":
         _perform(plan, [stage for stage in stages if stage.kind == "encoder"], device, resume)
         for kind in ("policy", "episodes"):
             stages_side_by_side(plan, [stage for stage in stages if stage.kind == kind], resume)
-        stages = [stage for stage in stages if stage.kind == "tables"]
+        stages = [stage for stage in stages if stage in reports]
     _perform(plan, stages, device, resume)
-    _print_tables(tables)
+    for report in reports:
+        _print_tables(report)
 
 
 @train.command()
@@ -199,10 +200,12 @@ def tables(
     name: Annotated[str | None, typer.Argument(help="Experiment; default: all.")] = None,
     scale: ScaleOption = "smoke",
 ) -> None:
-    """Write the tables again from recorded episode rows; nothing is trained or evaluated."""
+    """Write the tables and learning curves again from what is recorded; nothing is trained or evaluated."""
     plan = _plan(ctx, scale)
-    for experiment in [name] if name else plan.project.experiments:
-        stage = plan.tables(experiment, plan.project.experiment(experiment).seeds)
+    names = [name] if name else list(plan.project.experiments)
+    reports = [stage for n in names for stage in plan.reports(n, plan.project.experiment(n).seeds)]
+    recorded = [r for r in reports if any((s.folder / s.outputs[0]).exists() for s in r.upstream)]
+    for stage in recorded or reports:
         _perform(plan, [stage], "cpu", True)
         _print_tables(stage)
 
@@ -315,7 +318,7 @@ def _print_tables(stage: Stage) -> None:
     for name in stage.outputs:
         if name.endswith(".md"):
             typer.echo((stage.folder / name).read_text("utf-8"))
-    typer.echo(f"tables: {stage.folder}", err=True)
+    typer.echo(f"{stage.kind}: {stage.folder}", err=True)
 
 
 def _collect(ctx: typer.Context, scale: str) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def test_every_command_explains_itself(words: list[str]) -> None:
 
 def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> None:
     lines = romnav("list").stdout.splitlines()
-    assert lines[0].startswith("spawn-goal: ")
+    assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == ["pretrain", "spawn-goal"]
     assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in lines]
     assert ["uniform-nocap", "UniformNoCap", "(RoM)"] in [line.split() for line in lines]
 
@@ -240,6 +240,51 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     assert romnav("train", "policy", "rom", "--no-resume").exit_code == 0
     assert ran == ["policy rom, seed 0"]
     assert "rom" in romnav("eval", "--paired", "rom", "uniform").stdout
+
+
+def test_learning_curves_need_training_alone(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fifteen runs, no evaluation; figure and table come again from what the runs recorded."""
+    ran: list[str] = []
+
+    def encoder(self: Any, stage: Any, progress: Any) -> dict[str, Any]:
+        ran.append(stage.name)
+        for name in stage.outputs:
+            (stage.folder / name).write_text(stage.key)
+        return {}
+
+    def policy(self: Any, stage: Any, progress: Any) -> dict[str, Any]:
+        ran.append(stage.name)
+        (stage.folder / "policy.pt").write_text("weights")
+        count = stage.settings.navigation.ppo.iterations
+        rows = [f"{k},{100 * k},{2 * k},8,0.{stage.seed}" for k in range(1, count + 1)]
+        (stage.folder / "curve.csv").write_text("\n".join(["iteration,steps,cpu_seconds,episodes,success", *rows]))
+        return {"steps": 1, "hours": 0.1}
+
+    def in_this_process(commands: Mapping[str, Sequence[str]], workers: int) -> None:
+        for words in commands.values():
+            result = romnav(*words)
+            assert result.exit_code == 0, result.output
+
+    monkeypatch.setattr(launch, "side_by_side", in_this_process)
+    monkeypatch.setattr(stages.Stages, "encoder", encoder)
+    monkeypatch.setattr(stages.Stages, "policy", policy)
+    assert "no arm of pretrain is trained; run `romnav run ablation pretrain`" in romnav("tables", "pretrain").stderr
+    result = romnav("run", "ablation", "pretrain")
+    assert result.exit_code == 0, result.output
+    assert len(ran) == 1 + 15
+    assert [line.split("|")[2].strip() for line in result.stdout.splitlines() if "No Pre" in line] == ["20.0"]
+    folder = project / "results" / "smoke"
+    files = [
+        folder / "figures" / "pretrain.png",
+        *(folder / "tables" / f"pretrain.{end}" for end in ("tex", "md", "csv")),
+    ]
+    assert not [*folder.glob("*/*/episodes.*")]
+    before = [file.read_bytes() for file in files]
+    for file in files:
+        file.unlink()
+    assert romnav("tables").stdout == result.stdout
+    assert [file.read_bytes() for file in files] == before
+    assert len(ran) == 1 + 15
 
 
 def test_control_c_says_how_to_go_on(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

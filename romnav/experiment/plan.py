@@ -93,7 +93,7 @@ class Plan:
             RomnavError: No experiment has this arm, or its changes are invalid.
         """
         name, experiment = self.project.having(arm)
-        return self.scale.changed(arm, experiment.arms[arm], self.project.file(name))
+        return self.scale.changed(arm, experiment, self.project.file(name))
 
     def encoder(self, settings: Scale | None = None, sensor: str = "lidar") -> Stage:
         """The encoder of a sensor (a key of `PRETRAINING`); an arm that changes it gets one of its own."""
@@ -173,6 +173,30 @@ class Plan:
             upstream=upstream,
             arm=arm,
             seed=seed,
+        )
+
+    def reports(self, name: str, seeds: Iterable[int]) -> list[Stage]:
+        """Everything that is written of an experiment in the end.
+
+        Raises:
+            RomnavError: As `tables`.
+        """
+        experiment, seeds = self.project.experiment(name), tuple(seeds)
+        written = [self.tables(name, seeds)] if experiment.tables else []
+        return [*written, *([self.curves(name, seeds)] if experiment.curves else [])]
+
+    def curves(self, name: str, seeds: Iterable[int]) -> Stage:
+        """The learning curves of an experiment, as a figure and a table."""
+        experiment = self.project.experiment(name)
+        return Stage(
+            kind="curves",
+            name=f"curves {name}",
+            folder=self.folder,
+            outputs=(f"figures/{name}.png", *(f"tables/{name}.{format}" for format in ("tex", "md", "csv"))),
+            record=self.folder / "figures" / f"{name}.json",
+            settings=experiment,
+            uses=("title", "labels"),
+            upstream=tuple(self.policy(arm, seed) for arm in experiment.arms for seed in seeds),
         )
 
     def tables(self, name: str, seeds: Iterable[int]) -> Stage:

@@ -9,7 +9,7 @@ from typing import Any
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import EvaluationSpec
-from romnav.experiment.spec import Arm, parse, read_toml, suggest
+from romnav.experiment.spec import Experiment, parse, read_toml, suggest
 from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
@@ -51,15 +51,21 @@ class ScaleFile:
         self._data = read_toml(file)
         self.settings = parse(Scale, self._data, file)
 
-    def changed(self, name: str, arm: Arm, file: Path) -> Scale:
-        """The settings of arm ``name`` of the experiment in ``file``.
+    def changed(self, name: str, experiment: Experiment, file: Path) -> Scale:
+        """The settings of arm ``name`` of the ``experiment`` in ``file``.
 
         Raises:
-            RomnavError: The arm changes a setting that does not exist, or to a value of a wrong type.
+            RomnavError: The arm, or the experiment at this scale, changes a setting that does not exist, or to a value
+                of a wrong type.
         """
-        if "evaluation" in arm.changes:
-            raise RomnavError(f"{file}: arms.{name}.evaluation: set it in the scale, all arms share it")
-        return parse(Scale, _merge(self._data, arm.changes), file, f"arms.{name}.")
+        data = self._data
+        shared, own = experiment.scales.get(self.name, {}), experiment.arms[name].changes
+        for key, change in ((f"scales.{self.name}", shared), (f"arms.{name}", own)):
+            if "evaluation" in change:
+                raise RomnavError(f"{file}: {key}.evaluation: set it in the scale, all arms share it")
+            data = _merge(data, change)
+            settings = parse(Scale, data, file, f"{key}.")
+        return settings
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from romnav.config import Config
 from romnav.errors import RomnavError
@@ -41,12 +41,21 @@ class Experiment(Config):
     """What is done with the arms."""
     title: str
     """One line for lists."""
-    tables: tuple[str, ...]
-    """Tables to write from the episode rows."""
+    tables: tuple[str, ...] = ()
+    """Tables to write from the episode rows; without any, the arms are not evaluated."""
+    curves: bool = False
+    """Whether to draw and tabulate success while training, over all training seeds."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds of every arm."""
     arms: dict[str, Arm]
     """Arms by the name of their results folder."""
+    scales: dict[str, dict[str, Any]] = Field(default={})
+    """Settings that all arms change at a scale, e.g. ``scales.paper.navigation.env.envs = 3072``."""
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Label of every arm."""
+        return {name: arm.label for name, arm in self.arms.items()}
 
     @field_validator("arms")
     @classmethod
@@ -60,14 +69,17 @@ def load_experiments(folder: Path) -> dict[str, Experiment]:
     """Reads every ``<folder>/<name>.toml``.
 
     Raises:
-        RomnavError: A file is invalid, or two experiments give one arm different settings.
+        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings.
     """
+    known = {file.stem for file in folder.glob("scales/*.toml")}
     experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
     seen: dict[str, tuple[str, Arm]] = {}
     for name, experiment in experiments.items():
+        for scale in experiment.scales.keys() - known:
+            raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
         for arm_name, arm in experiment.arms.items():
             first, same = seen.setdefault(arm_name, (name, arm))
-            if same.changes != arm.changes:
+            if (same.changes, experiments[first].scales) != (arm.changes, experiment.scales):
                 raise RomnavError(
                     f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
                 )

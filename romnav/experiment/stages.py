@@ -65,6 +65,7 @@ class Stages:
             "policy": self.policy,
             "episodes": self.episodes,
             "tables": self.tables,
+            "curves": self.curves,
         }
 
     def encoder(self, stage: Stage, progress: Progress) -> dict[str, Any]:
@@ -191,6 +192,27 @@ class Stages:
         for done, name in enumerate(names, 1):
             formats.write(tables.build(specs[name], bootstrap), stage.folder)
             progress(done, len(names), name)
+        return {}
+
+    def curves(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Draws and tabulates the learning curves that are there."""
+        from romnav.report import curves, formats
+
+        experiment = cast(Experiment, stage.settings)
+        name = Path(stage.outputs[0]).stem
+        arms, commits = {}, set()
+        for arm, label in experiment.labels.items():
+            runs = [run for run in stage.upstream if run.arm == arm and (run.folder / "policy.pt").exists()]
+            if runs:
+                unfreeze_at = cast(Scale, runs[0].settings).navigation.encoder.unfreeze_at
+                arms[arm] = curves.read(label, unfreeze_at, [run.folder / "curve.csv" for run in runs])
+            records = [store.read(run) for run in runs]
+            commits |= {record.provenance["commit"][:12] for record in records if record and record.outputs}
+        if not arms:
+            raise RomnavError(f"{stage.folder}: no arm of {name} is trained; run `romnav run ablation {name}`")
+        provenance = {"scale": self.plan.scale.name, "commit": ", ".join(sorted(commits))}
+        curves.draw(arms, stage.folder / stage.outputs[0])
+        formats.write(curves.tabulate(name, experiment.title, arms, provenance), stage.folder / "tables")
         return {}
 
     def world(self, spec: WorldSpec, progress: Progress | None = None) -> World:

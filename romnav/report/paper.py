@@ -48,6 +48,9 @@ CONTRASTS: dict[tuple[str, str], dict[tuple[int, str], tuple[float, bool]]] = {
 """Tables nav-levels and spawngoal-levels-rom: (horizon in s, level) to the difference of success rates in
 percent and whether its 95 % interval excludes zero."""
 
+ITERATION_TIME: dict[str, float] = {"frozen": 1.0, "unfrozen": 1.15}
+"""Duration of an iteration relative to one with a frozen encoder (Sec. IV-B, Pretrained Encoders)."""
+
 FAILURES: dict[str, dict[str, float]] = {
     "rom-hum": {"falls": 16.3, "timeouts": 4.9},
     "rom-nav": {"falls": 8.3, "timeouts": 3.7},

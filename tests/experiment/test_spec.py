@@ -102,8 +102,8 @@ def scales(tmp_path: Path) -> Path:
 
 def test_an_arm_changes_only_what_it_names(scales: Path) -> None:
     scale = ScaleFile(scales, "smoke")
-    arm = parse(Experiment, tomllib.loads(EXPERIMENT), Path("e.toml")).arms["slow"]
-    changed = scale.changed("slow", arm, Path("e.toml"))
+    experiment = parse(Experiment, tomllib.loads(EXPERIMENT), Path("e.toml"))
+    changed = scale.changed("slow", experiment, Path("e.toml"))
     assert changed.navigation.env.command.forward == 0.5
     assert changed.navigation.env.envs == 8
     expected = scale.settings.model_dump()
@@ -123,10 +123,32 @@ def test_an_arm_changes_only_what_it_names(scales: Path) -> None:
 )
 def test_a_wrong_change_names_the_experiment_file(scales: Path, change: str, message: str) -> None:
     text = EXPERIMENT.replace("navigation.env.command.forward = 0.5", change)
-    arm = parse(Experiment, tomllib.loads(text), Path("e.toml")).arms["slow"]
+    experiment = parse(Experiment, tomllib.loads(text), Path("e.toml"))
     with pytest.raises(RomnavError) as error:
-        ScaleFile(scales, "smoke").changed("slow", arm, Path("e.toml"))
+        ScaleFile(scales, "smoke").changed("slow", experiment, Path("e.toml"))
     assert str(error.value).startswith(f"e.toml: {message}")
+
+
+def test_all_arms_change_together_at_one_scale(scales: Path) -> None:
+    text = EXPERIMENT + "[scales.smoke.navigation]\nenv.envs = 3\nenv.command.forward = 0.75\n"
+    text += "[scales.cpu.lidar]\nrows = 20\n"
+    experiment = parse(Experiment, tomllib.loads(text), Path("e.toml"))
+    scale = ScaleFile(scales, "smoke")
+    found = {name: scale.changed(name, experiment, Path("e.toml")) for name in experiment.arms}
+    assert {name: s.navigation.env.envs for name, s in found.items()} == {"rom": 3, "slow": 3}
+    assert {name: s.navigation.env.command.forward for name, s in found.items()} == {"rom": 0.75, "slow": 0.5}
+    assert found["rom"].lidar.rows == 15
+    wrong = parse(Experiment, tomllib.loads(text.replace("envs", "envz")), Path("e.toml"))
+    with pytest.raises(RomnavError, match=r"unknown key scales\.smoke\.navigation\.env\.envz; did you mean envs"):
+        scale.changed("rom", wrong, Path("e.toml"))
+
+
+def test_an_experiment_names_only_scales_that_there_are(tmp_path: Path) -> None:
+    (tmp_path / "scales").mkdir()
+    (tmp_path / "scales" / "smoke.toml").write_text("")
+    (tmp_path / "e.toml").write_text(EXPERIMENT + "[scales.smok.lidar]\nrows = 3\n")
+    with pytest.raises(RomnavError, match=r"e\.toml: scales: unknown scale smok; did you mean smoke\?"):
+        load_experiments(tmp_path)
 
 
 def test_an_unknown_scale_names_the_nearest(scales: Path) -> None:
@@ -141,4 +163,4 @@ def test_the_projects_own_experiments_are_valid_at_every_scale() -> None:
     for file in files:
         scale = ScaleFile(file.parent, file.stem)
         for name, experiment in project.experiments.items():
-            assert [scale.changed(arm, spec, project.file(name)) for arm, spec in experiment.arms.items()]
+            assert [scale.changed(arm, experiment, project.file(name)) for arm in experiment.arms]
