@@ -80,7 +80,7 @@ def read(label: str, unfreeze_at: float, files: Sequence[Path]) -> Curves:
     Raises:
         RomnavError: A file is unreadable, or the runs differ in length.
     """
-    seeds = []
+    seeds: list[pd.DataFrame] = []
     for file in files:
         try:
             run = pd.read_csv(file)
@@ -176,7 +176,7 @@ def _cells(curves: Curves, reference: float) -> tuple[Cell, ...]:
     shown = f"{final.lo:.1f} to {final.hi:.1f}" if math.isfinite(final.value) else "–"
     facts = {"lo": final.lo, "hi": final.hi, "n": final.n}
     return (
-        number(final.value, 1, **facts),
+        Cell(final.value, number(final.value, 1).text, facts),
         Cell(final.hi - final.lo, shown, facts),
         number(factor, 2),
     )
