@@ -27,8 +27,11 @@ Perception = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 def to_command(actions: Tensor, spec: CommandSpec) -> Tensor:
-    """Velocity command (E, 3) in m/s and rad/s of actions (E, 3) in [-1, 1]; zero is no motion."""
-    forward = torch.where(actions[:, 0] >= 0, actions[:, 0] * spec.forward, actions[:, 0] * spec.reverse)
+    """Velocity command (E, 3) in m/s and rad/s of actions (E, 3) in [-1, 1], which span the limits linearly.
+
+    A policy that knows nothing yet therefore drifts forward, at the middle of [-reverse, forward], and gets about.
+    """
+    forward = 0.5 * (spec.forward - spec.reverse + actions[:, 0] * (spec.forward + spec.reverse))
     return torch.stack([forward, actions[:, 1] * spec.lateral, actions[:, 2] * spec.turn], dim=1)
 
 

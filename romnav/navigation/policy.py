@@ -20,6 +20,16 @@ STATE_SCALE = (0.1, 0.1, 1.0, 0.25, 1.0, 1.0, 1.0, 4.0, 1.0)
 """Brings goal (m) and command (m/s, rad/s) to the order of one."""
 
 
+def with_bearing(state: Tensor) -> Tensor:
+    """Non-visual observation (B, 9) scaled to the order of one, with the goal's bearing as a unit vector: (B, 11).
+
+    The bearing is in ``dx, dy`` already, but near the goal these are small, and dividing them is what a narrow dense
+    layer learns slowest.
+    """
+    bearing = torch.nn.functional.normalize(state[:, :2], dim=1, eps=0.05)
+    return torch.cat([state * state.new_tensor(STATE_SCALE), bearing], dim=1)
+
+
 class GRULayer(torch.autograd.Function):
     """The recurrent part of one GRU layer over a rollout, with resets between steps.
 
@@ -160,8 +170,7 @@ class NavigationActor(MLPModel):
             hidden_dims=[spec.hidden],
             distribution_cfg={"class_name": "BetaDistribution"},
         )
-        self.register_buffer("scale", torch.tensor(STATE_SCALE))
-        self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim, embedding), nn.ELU())
+        self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + 2, embedding), nn.ELU())
         self.attention = Attention(tokens, channels, embedding, spec)
         self.core = RecurrentCore(visual + embedding, spec.recurrent)
         self.encoder: Encoder | None = None
@@ -172,7 +181,7 @@ class NavigationActor(MLPModel):
         """``[h_t, visual, state]`` of one step (B, ...) or, with episode starts as ``masks``, a rollout (T, B, ...)."""
         single = masks is None
         lead = obs["state"].shape[:-1]
-        state = self.state_embedding(obs["state"].flatten(0, -2) * self.scale)
+        state = self.state_embedding(with_bearing(obs["state"].flatten(0, -2)))
         lidar = obs["lidar"].flatten(0, -3).to(state.dtype)
         tokens = lidar if self.encoder is None else self.encoder(lidar)
         seen = torch.cat([self.attention(tokens, state), state], dim=1).unflatten(0, lead)
