@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.navigation.env import ACTIONS
-from romnav.navigation.policy import LAYERS, NavigationActor
+from romnav.navigation.policy import LAYERS, NavigationActor, reduced_precision
 from romnav.navigation.spec import PolicySpec, PPOSpec
 from romnav.sensing.encoder import Encoder
 
@@ -63,8 +63,13 @@ class PrivilegedCritic(MLPModel):
         hidden_state: HiddenState = None,
         stochastic_output: bool = False,
     ) -> Tensor:
-        """(..., 1) values."""
-        return super().forward(obs)
+        """(..., 1) values; products are bfloat16 up to the last layer."""
+        *hidden, last = self.mlp
+        features = self.get_latent(obs)
+        with reduced_precision(features):
+            for layer in hidden:
+                features = layer(features)
+        return last(features.float())
 
 
 class BoundedPPO(PPO):
