@@ -36,7 +36,7 @@ from torch.nn import functional as F
 from romnav.experiment.scales import Scale
 from romnav.navigation.env import ACTIONS, NavigationEnv
 from romnav.navigation.perception import LidarPerception
-from romnav.navigation.policy import LAYERS, NavigationActor
+from romnav.navigation.policy import LAYERS, NavigationActor, with_bearing
 from romnav.world.world import World
 
 SAME_ACTION = 0.02
@@ -76,7 +76,6 @@ class StockActor(RNNModel):
             for part, layer in (("ih", ours.core.input[k]), ("hh", ours.core.recurrent[k])):
                 getattr(self.rnn.rnn, f"weight_{part}_l{k}").data.copy_(layer.weight)
                 getattr(self.rnn.rnn, f"bias_{part}_l{k}").data.copy_(layer.bias)
-        self.register_buffer("scale", ours.scale)
         self.state_embedding = deepcopy(ours.state_embedding)
         self.attention = deepcopy(ours.attention)
         self.mlp = deepcopy(ours.mlp)
@@ -84,7 +83,7 @@ class StockActor(RNNModel):
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
         lead = obs["state"].shape[:-1]
-        state = self.state_embedding(obs["state"].flatten(0, -2) * self.scale)
+        state = self.state_embedding(with_bearing(obs["state"].flatten(0, -2)))
         visual = self.attend(self.encoder.tokens(obs["lidar"].flatten(0, -3)), state)
         seen = torch.cat([visual, state], dim=1).unflatten(0, lead)
         memory = self.rnn(seen, masks, hidden_state).squeeze(0)
