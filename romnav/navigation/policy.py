@@ -206,8 +206,8 @@ class NavigationActor(MLPModel):
         single = masks is None
         lead = obs["state"].shape[:-1]
         state = self.state_embedding(with_bearing(obs["state"].flatten(0, -2)))
-        lidar = obs["lidar"].flatten(0, -3).to(state.dtype)
-        tokens = lidar if self.encoder is None else self.encoder(lidar)
+        lidar = obs["lidar"].flatten(0, -3)
+        tokens = lidar if self.encoder is None else self.encoder(lidar.float())
         seen = torch.cat([self.attention(tokens, state), state], dim=1).unflatten(0, lead)
         if single:
             hidden = self._hidden_for(lead[0], seen)
