@@ -165,10 +165,10 @@ class PpoSpec(Config):
     """Per pass."""
     hidden: tuple[int, ...] = (256, 128, 64)
     """Widths of the policy and of the critic."""
-    learning_rate: tuple[float, float] = (2e-4, 1e-3)
-    """Range of the adaptive rate: below the floor a small batch collapses it."""
-    desired_kl: float = 0.01
-    """Of the adaptive rate."""
+    learning_rate: tuple[float, float] = (2e-4, 1.5e-3)
+    """Range of the adaptive rate; it starts at the floor."""
+    desired_kl: float = 0.02
+    """Of a whole iteration."""
     entropy: float = 0.003
     """Weight of the entropy."""
     std: tuple[float, float, float] = (0.12, 0.25, 1.0)

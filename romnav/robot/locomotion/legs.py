@@ -31,7 +31,8 @@ class Legs:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        offset, fixed, limits, self._axes = [], [], [], []
+        offset, fixed, limits = [], [], []
+        axes: list[int] = []
         for side in SIDES:
             bodies = [model.body(f"{side}_{'knee_link' if j == 'knee' else j + '_link'}") for j in LEG]
             joints = [model.joint(f"{side}_{j}_joint") for j in LEG]
@@ -41,30 +42,38 @@ class Legs:
                 mujoco.mju_quat2Mat(matrix, body.quat)
             fixed.append(matrices.reshape(6, 3, 3))
             limits.append([j.range.tolist() for j in joints])
-            self._axes = [int(j.axis.argmax()) for j in joints]
-        self._offset = torch.tensor(offset, dtype=torch.float32)[..., None]
-        self._fixed = torch.stack(fixed).float()
+            axes = [int(j.axis.argmax()) for j in joints]
+        # Each joint's transform is fixed + sin(q) first + (1 - cos(q)) second (Rodrigues), from parent to child.
+        cross = torch.zeros(6, 3, 3)
+        for k, axis in enumerate(axes):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            cross[k, i, j], cross[k, j, i] = -1.0, 1.0
+        turn = torch.stack(fixed).float()
+        self._fixed = torch.eye(4).repeat(2, 6, 1, 1)
+        self._fixed[..., :3, :3] = turn
+        self._fixed[..., :3, 3] = torch.tensor(offset, dtype=torch.float32)
+        self._first, self._second = torch.zeros(2, 6, 4, 4), torch.zeros(2, 6, 4, 4)
+        self._first[..., :3, :3] = turn @ cross
+        self._second[..., :3, :3] = turn @ cross @ cross
+        self._axis = torch.eye(4)[axes][..., None]
         self.limits = torch.tensor(limits, dtype=torch.float32)
         straight = torch.tensor([0.0, 0.0, 0.0, STRAIGHT, 0.0, 0.0]).expand(1, 2, 6)
-        self._hip = self._offset[:, 0, :, 0]
+        self._hip = self._fixed[:, 0, :3, 3]
         self._reach = (self.forward(straight)[0] - self._hip).norm(dim=-1, keepdim=True)
 
     def forward(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ankle position (n, 2, 3), rotation (n, 2, 3, 3) and the Jacobian (n, 2, 6, 6) of (position, rotation)."""
-        n = joints.shape[0]
-        position = torch.zeros(n, 2, 3, 1)
-        turn = torch.eye(3).expand(n, 2, 3, 3)
-        anchors, axes = [], []
-        for k, axis in enumerate(self._axes):
-            position = position + turn @ self._offset[:, k]
-            turn = turn @ self._fixed[:, k]
-            anchors.append(position[..., 0])
-            axes.append(turn[..., axis])
-            turn = turn @ rotation(axis, joints[..., k])
-        end = position[..., 0]
-        a = torch.stack(axes, dim=-1)
-        lever = end[..., None] - torch.stack(anchors, dim=-1)
-        return end, turn, torch.cat([torch.linalg.cross(a, lever, dim=-2), a], dim=-2)
+        s, c = torch.sin(joints)[..., None, None], torch.cos(joints)[..., None, None]
+        local = self._fixed + s * self._first + (1.0 - c) * self._second
+        frames = [local[:, :, 0]]
+        for k in range(1, 6):
+            frames.append(frames[-1] @ local[:, :, k])
+        chain = torch.stack(frames, dim=2)
+        # A joint turns about its own axis: the child's frame has the axis where the parent's has it.
+        axes = (chain @ self._axis)[..., :3, 0]
+        anchors, end = chain[..., :3, 3], chain[:, :, -1, :3, 3]
+        jacobian = torch.cat([torch.linalg.cross(axes, end[:, :, None] - anchors), axes], dim=-1)
+        return end, chain[:, :, -1, :3, :3], jacobian.transpose(-1, -2)
 
     def inverse(
         self, position: Tensor, turn: Tensor, start: Tensor, *, iterations: int = 2, damping: float = 2e-4

@@ -69,14 +69,18 @@ class Controller:
         return self.reference
 
     def act(self, action: Tensor, ids: Tensor | None = None) -> None:
-        """Step robots with residual actions (n, 15); all, or only `ids`."""
-        self.action = action.clamp(-4.0, 4.0)
+        """Step robots with residual actions (n, 15) as seen in the mirror of `observe`; all, or only `ids`."""
+        self.action = reflect(action.clamp(-4.0, 4.0), ACTION_MIRROR, self.reference.side)
         target = self.spec.task.action_scale * self.action
         target[:, :12] += self.reference.joints.flatten(1) + self.reference.torque.flatten(1) / self.robots.kp[:12]
         self.robots.step(target, ids)
 
     def observe(self, command: Tensor, ground: HeightMap) -> Tensor:
-        """Observation (n, d) of the policy; `MIRROR` says how it mirrors."""
+        """Observation (n, d) of the policy, mirrored (by `MIRROR`) while the right foot stands.
+
+        The policy always sees itself standing on the left foot, so it is left-right symmetric by construction
+        and learns one step instead of two.
+        """
         r, ref = self.robots, self.reference
         yaw = heading_of(r.orientation)
         angle = 2 * torch.pi * (ref.phase + (ref.side < 0)) / 2
@@ -90,7 +94,7 @@ class Controller:
         points = r.pelvis[:, None, :2] + turn_xy(self._scan.expand(len(yaw), -1, -1), yaw[:, None])
         level = ref.sole[..., 2].amin(1)
         scan = ground(points, (level + 0.8)[:, None]) - level[:, None]
-        return torch.cat(
+        seen = torch.cat(
             [
                 command,
                 torch.stack([torch.sin(angle), torch.cos(angle)], dim=1),
@@ -109,6 +113,7 @@ class Controller:
             ],
             dim=1,
         )
+        return reflect(seen, MIRROR, ref.side)
 
     def snapshot(self, ids: Tensor) -> dict[str, Tensor]:
         """State of robots `ids` and of their gait, before `refer`: what `restore` needs to go on walking."""
@@ -174,15 +179,10 @@ ACTION_MIRROR = _mirror(_joints_mirror())
 PRIVILEGED_MIRROR = _mirror([(1, 1), (0, 1)], [(0, 1), (1, 1)], [(0, 1), (1, -1), (2, -1)], [(0, 1)])
 
 
-def augment(env: VecEnv, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
-    """Append the mirror image of every sample (rsl-rl's symmetry hook)."""
-    if obs is not None:
-        tables = {"policy": MIRROR, "privileged": PRIVILEGED_MIRROR}
-        image = {key: obs[key][:, index] * sign for key, (index, sign) in tables.items()}
-        obs = torch.cat([obs, TensorDict(image, batch_size=obs.batch_size)])
-    if actions is not None:
-        actions = torch.cat([actions, actions[:, ACTION_MIRROR[0]] * ACTION_MIRROR[1]])
-    return obs, actions
+def reflect(values: Tensor, table: tuple[Tensor, Tensor], side: Tensor) -> Tensor:
+    """Rows of values (n, d) mirrored where `side` (n,) is negative."""
+    index, sign = table
+    return torch.where(side[:, None] < 0, values[:, index] * sign, values)
 
 
 def tracking_error(
@@ -217,8 +217,8 @@ def tracking_error(
 class LocomotionEnv(VecEnv):
     """Robots on the lanes of a `Ground`, each kind of terrain with its own robots and levels.
 
-    A robot on a lane walks it from a level place to the end under `steer`; it moves up a level when it arrives
-    within 1.5 times the commanded time and down when it falls early. Distance counts along the lane's path only.
+    A robot on a lane walks it from a level place to the end under `steer`; it moves up a level when it has
+    covered most of the way in good time and down when it falls early. Distance counts along the lane's path only.
     """
 
     def __init__(self, spec: LocomotionSpec, lanes: list[Lane], *, threads: int = 0) -> None:
@@ -354,6 +354,8 @@ class LocomotionEnv(VecEnv):
             [r.touch[:, r.feet].float(), self.friction[:, None], self.payload[:, None], self.average,
              self.value.clamp(max=20.0)[:, None] / 4], dim=1,
         )  # fmt: skip
+        side = self.control.reference.side
+        privileged = reflect(privileged, PRIVILEGED_MIRROR, side)
         policy = self.control.observe(self.command, self.ground.map)
         return TensorDict({"policy": policy, "privileged": privileged}, batch_size=[self.num_envs])
 
@@ -424,8 +426,9 @@ class LocomotionEnv(VecEnv):
         covered = (self.arc - self.start).abs()[ids]
         time = self.episode_length_buf[ids] * self.dt
         quick = covered > 0.66 * self.speed[ids] * time
-        up, down = arrived[ids] & quick, fell[ids]
-        level = self.level[ids] + up.long() - (down & (self._uniform(0, 1, len(ids)) < 0.6)).long()
+        part = covered / self.ground.length[self.lane[ids]]
+        up, down = (part > 0.45) & quick, fell[ids] & (part < 0.3)
+        level = self.level[ids] + up.long() - down.long()
         top = self._top[ids]
         # Beyond the top, practise all levels.
         wander = (self._uniform(0.0, 1.0, len(ids)) * (top + 1)).long()
@@ -433,10 +436,9 @@ class LocomotionEnv(VecEnv):
         for k, kind in enumerate(self.kinds):
             mine = self.kind[ids] == k
             log[f"/level/{kind}"] = self.level[self.kind == k].float().mean().item()
-            if mine.any():
-                log[f"/ended/{kind}"] = int(mine.sum())
-                log[f"/arrived/{kind}"] = int((arrived[ids] & mine).sum())
-                log[f"/fallen/{kind}"] = int((fell[ids] & mine).sum())
+            log[f"/ended/{kind}"] = int(mine.sum())
+            log[f"/arrived/{kind}"] = int((arrived[ids] & mine).sum())
+            log[f"/fallen/{kind}"] = int((fell[ids] & mine).sum())
         return log
 
     def state_dict(self) -> dict[str, Any]:

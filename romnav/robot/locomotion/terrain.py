@@ -235,10 +235,11 @@ class Ground:
         q = pick.gather(1, (k + 1)[..., None].expand(-1, -1, 2))[:, 0]
         return p + t * (q - p)
 
-    def project(self, lane: Tensor, point: Tensor, arc: Tensor, window: float = 0.6) -> Tensor:
-        """Arc length (n,) of the nearest point of the path within `window` of the last one, `arc`."""
-        tries = arc[:, None] + torch.linspace(-window, window, 49)
-        at = self.at(lane.repeat_interleave(49), tries.flatten()).reshape(-1, 49, 2)
+    def project(self, lane: Tensor, point: Tensor, arc: Tensor, window: float = 0.24) -> Tensor:
+        """Arc length (n,) of the nearest point of the path within `window` of the last one, `arc`, to 2 cm."""
+        count = 2 * round(window / 0.02) + 1
+        tries = arc[:, None] + torch.linspace(-window, window, count)
+        at = self.at(lane.repeat_interleave(count), tries.flatten()).reshape(-1, count, 2)
         best = (at - point[:, None]).square().sum(-1).argmin(1, keepdim=True)
         return tries.gather(1, best)[:, 0].clamp(min=0.0).minimum(self.length[lane])
 
