@@ -32,6 +32,16 @@ RESULT_COLUMNS = {
     "spl": "SPL",
     "falls": "falls",
 }
+TERRAIN_COLUMNS = {
+    "terrain": "terrain",
+    "command": "command",
+    "trials": "trials",
+    "crossed": "crossed",
+    "target": "to reach",
+    "fell": "fell",
+    "velocity_error": "error m/s",
+    "yaw_error": "error rad/s",
+}
 CONTRAST_COLUMNS = {
     "a": "a",
     "b": "b",
@@ -158,20 +168,52 @@ def policy(
     _execute(plan, [plan.policy(arm, s) for s in seeds], device, resume, {"policy"})
 
 
+@train.command()
+def locomotion(
+    ctx: typer.Context,
+    scale: ScaleOption = "smoke",
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Train the policy that walks the humanoid; a larger number of iterations in the scale continues it."""
+    plan = _plan(ctx, scale)
+    _execute(plan, [plan.locomotion()], device, resume, {"locomotion"})
+
+
+@train.command()
+def gaits(
+    ctx: typer.Context,
+    scale: ScaleOption = "smoke",
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Record the gait library of the locomotion policy: how it walks on stairs and ramps, to start episodes there."""
+    plan = _plan(ctx, scale)
+    _execute(plan, [plan.gaits()], device, resume, {"gaits"})
+
+
 @app.command("eval")
 def evaluate(
     ctx: typer.Context,
-    arms: Annotated[list[str], typer.Argument(help="Trained arms, or the scripted ones: oracle, straight.")],
+    arms: Annotated[
+        list[str],
+        typer.Argument(help="Trained arms, the scripted ones (oracle, straight), or locomotion for its terrain test."),
+    ],
     paired: Annotated[bool, typer.Option("--paired", help="Compare the arms episode by episode.")] = False,
     scale: ScaleOption = "smoke",
     seed: SeedOption = None,
     device: DeviceOption = "cpu",
     resume: ResumeOption = True,
 ) -> None:
-    """Evaluate arms on the episode set that all arms share."""
+    """Evaluate arms on the episode set that all arms share, or the locomotion policy on its terrain test."""
     from romnav.experiment.run import require_trained
 
     plan = _plan(ctx, scale)
+    if "locomotion" in arms:
+        _evaluate_locomotion(plan, device, resume)
+        arms = [arm for arm in arms if arm != "locomotion"]
+        if not arms:
+            return
     stages = [plan.episodes(arm, s) for arm in arms for s in (plan.project.seeds(arm) if seed is None else (seed,))]
     require_trained(stages)
     _execute(plan, stages, device, resume, {"episodes"})
@@ -257,6 +299,18 @@ def world(
     typer.echo(path)
 
 
+@play.command("locomotion")
+def play_locomotion(ctx: typer.Context, scale: ScaleOption = "smoke") -> None:
+    """Draw how the locomotion policy walks each terrain, and its training curve."""
+    from romnav.robot.locomotion.play import curve, strip
+
+    plan = _plan(ctx, scale)
+    walked = plan.locomotion()
+    for path in strip(walked.folder / "policy.pt", plan.folder / "figures"):
+        typer.echo(path)
+    typer.echo(curve(walked.folder / "curve.csv", plan.folder / "figures" / "locomotion-curve.png"))
+
+
 @app.command()
 def bench(
     ctx: typer.Context,
@@ -312,6 +366,26 @@ def _perform(plan: Plan, stages: list[Stage], device: str, resume: bool) -> None
 
     require_device(device)
     execute(stages, Stages(plan, device, resume).actions, resume, lambda line: typer.echo(line, err=True))
+
+
+def _evaluate_locomotion(plan: Plan, device: str, resume: bool) -> None:
+    from json import loads
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from romnav.experiment import store
+
+    terrain, walked = plan.terrain(), plan.locomotion()
+    if not (walked.folder / "policy.pt").exists():
+        command = f"romnav train locomotion --scale {plan.scale.name}"
+        raise RomnavError(f"{walked.folder}: no locomotion policy; train one with `{command}`")
+    _execute(plan, [terrain], device, resume, {"terrain"})
+    record = store.read(terrain)
+    turning = record.facts["yaw_error"] if record else {}
+    rows = loads((terrain.folder / terrain.outputs[0]).read_text("utf-8"))
+    rows = [row | {"yaw_error": turning.get(row["terrain"])} for row in rows]
+    _print_table(Console(), Table(title="Locomotion, shares of trials"), rows, TERRAIN_COLUMNS)
 
 
 def _print_tables(stage: Stage) -> None:

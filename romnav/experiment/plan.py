@@ -129,6 +129,40 @@ class Plan:
             sensor=sensor,
         )
 
+    def locomotion(self) -> Stage:
+        """The policy that walks the humanoid. More iterations continue it, so its checkpoint is never scratch."""
+        folder = self.folder / "locomotion"
+        return Stage(
+            kind="locomotion",
+            name="locomotion",
+            folder=folder,
+            outputs=("policy.pt", "curve.csv"),
+            record=folder / "policy.json",
+            settings=self.scale.settings,
+            uses=("locomotion",),
+        )
+
+    def terrain(self) -> Stage:
+        """The fixed test of the locomotion policy."""
+        return self._after_locomotion("terrain", "terrain test", "terrain.json")
+
+    def gaits(self) -> Stage:
+        """The gait library of the locomotion policy."""
+        return self._after_locomotion("gaits", "gait library", "gaits.pt")
+
+    def _after_locomotion(self, kind: str, name: str, output: str) -> Stage:
+        walked = self.locomotion()
+        return Stage(
+            kind=kind,
+            name=name,
+            folder=walked.folder,
+            outputs=(output,),
+            record=walked.folder / f"{kind}-record.json",
+            settings=walked.settings,
+            uses=(),
+            upstream=(walked,),
+        )
+
     def policy(self, arm: str, seed: int) -> Stage:
         """The trained policy of an arm."""
         settings = self.settings(arm)

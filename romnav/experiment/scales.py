@@ -11,6 +11,7 @@ from romnav.errors import RomnavError
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
 from romnav.navigation.spec import NavigationSpec
+from romnav.robot.spec import LocomotionSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
 
@@ -32,6 +33,8 @@ class Scale(Config):
     """Judging the encoders."""
     navigation: NavigationSpec = NavigationSpec()
     """Task, policy and reinforcement learning."""
+    locomotion: LocomotionSpec = LocomotionSpec()
+    """The humanoid, and the policy that walks it."""
     evaluation: EvaluationSpec = EvaluationSpec()
     """Evaluation terrain and episodes."""
 

@@ -62,6 +62,9 @@ class Stages:
         return {
             "encoder": self.encoder,
             "quality": self.quality,
+            "locomotion": self.locomotion,
+            "terrain": self.terrain,
+            "gaits": self.gaits,
             "policy": self.policy,
             "episodes": self.episodes,
             "tables": self.tables,
@@ -112,6 +115,31 @@ class Stages:
         files.write(stage.folder / "quality.json", json.dumps(measured, indent=2) + "\n")
         draw_encoder(*judged, stage.folder / "encoder.png", device=self.device)
         return {}
+
+    def locomotion(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Trains the policy that walks the humanoid."""
+        from romnav.robot.locomotion.train import train, training_cost
+
+        settings = cast(Scale, stage.settings)
+        path = train(settings.locomotion, stage.folder, device=self.device, resume=self.resume, progress=progress)
+        return training_cost(path)
+
+    def terrain(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Runs the fixed test of the locomotion policy."""
+        from romnav.robot.locomotion.evaluate import evaluate
+
+        rows = evaluate(stage.upstream[0].folder / "policy.pt", progress=progress)
+        turning = {row["terrain"]: row.pop("yaw_error") for row in rows}
+        files.write(stage.folder / "terrain.json", json.dumps(rows, indent=2) + "\n")
+        return {"yaw_error": turning}
+
+    def gaits(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Records the gait library of the locomotion policy."""
+        from romnav.robot.gaits import record
+
+        library = record(stage.upstream[0].folder / "policy.pt")
+        library.save(stage.folder / "gaits.pt")
+        return {"gaits": len(library.gaits)}
 
     def policy(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Trains the policy of an arm."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import mujoco
 import mujoco.batch
@@ -28,12 +28,27 @@ FOOT_LENGTH, FOOT_WIDTH = 0.185, 0.07
 _SOLE_RADIUS = 0.01
 
 
+class Statics(Protocol):
+    """What stands on the plane z = 0."""
+
+    def add_to(self, model: mujoco.MjSpec) -> None:
+        """Add collision geoms to the world body."""
+        ...
+
+
 class Boxes(NamedTuple):
     """Static boxes of the ground: centres (n, 3), half sizes (n, 3), both m, and orientations (n, 4), wxyz."""
 
     centre: NDArray[np.float64]
     half: NDArray[np.float64]
     quat: NDArray[np.float64]
+
+    def add_to(self, model: mujoco.MjSpec) -> None:
+        """Add them to the world body."""
+        for centre, half, quat in zip(*self, strict=True):
+            model.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half, quat=quat, contype=1, conaffinity=1
+            )
 
 
 def _asset(name: str) -> str:
@@ -87,12 +102,12 @@ def _collide_with_ground(spec: mujoco.MjSpec, friction: float) -> None:
             spec.add_pair(geomname1=f"left_{a}", geomname2=f"right_{b}", condim=1)
 
 
-def build_spec(spec: RobotSpec, ground: Boxes, *, visual: bool = False) -> mujoco.MjSpec:
+def build_spec(spec: RobotSpec, ground: Statics, *, visual: bool = False) -> mujoco.MjSpec:
     """G1 and ground as an editable MuJoCo model.
 
     Args:
         spec: gains, friction, welded joints.
-        ground: static boxes; the plane z = 0 is always there.
+        ground: static geoms; the plane z = 0 is always there.
         visual: keep the meshes (for pictures; the dynamics are the same).
     """
     model = mujoco.MjSpec.from_file(_asset("g1_mjx.xml"))
@@ -125,8 +140,7 @@ def build_spec(spec: RobotSpec, ground: Boxes, *, visual: bool = False) -> mujoc
 
     world = model.worldbody
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
-    for centre, half, quat in zip(*ground, strict=True):
-        world.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half, quat=quat, contype=1, conaffinity=1)
+    ground.add_to(model)
     for body in model.bodies:
         if any(geom.contype or geom.conaffinity for geom in body.geoms) and body.name != "world":
             model.add_sensor(
@@ -152,9 +166,10 @@ def _single(array: NDArray[np.float64]) -> Tensor:
 
 
 class Humanoids:
-    """A batch of G1 robots, each alone on the same ground, stepped by native MuJoCo on all cores.
+    """A batch of G1 robots, each alone on the ground, stepped by native MuJoCo on all cores.
 
-    Results do not depend on the number of threads. Tensors are float32 copies of MuJoCo's float64 state.
+    All stand on the same ground unless `stand_on` gives each its own. Results do not depend on the number of
+    threads. Tensors are float32 copies of MuJoCo's float64 state.
 
     Attributes:
         pelvis, orientation, velocity, spin: (n, 3) position, (n, 3, 3) rotation, (n, 3) world linear and
@@ -166,7 +181,7 @@ class Humanoids:
         touch: (n, bodies) whether each collision body is in contact; `feet` are the columns of the feet.
     """
 
-    def __init__(self, spec: RobotSpec, ground: Boxes, count: int, *, threads: int = 0) -> None:
+    def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
         self.spec, self.count = spec, count
         self.model = build_spec(spec, ground).compile()
         self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
@@ -190,6 +205,10 @@ class Humanoids:
         self.torque = torch.zeros(count, len(JOINTS))
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         self._read()
+
+    def stand_on(self, models: list[mujoco.MjModel]) -> None:
+        """Give every robot the model it is in from now on, of `build_spec` with as many geoms as this one's."""
+        self.batch.set_models(models)
 
     def _read(self) -> None:
         b = self.batch

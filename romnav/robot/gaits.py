@@ -66,6 +66,10 @@ class GaitLibrary:
     def __init__(self, gaits: list[Gait]) -> None:
         self.gaits = gaits
 
+    def has(self, kind: str, direction: int) -> bool:
+        """Whether there is a walk up (+1) or down (-1) a slope of that kind."""
+        return any(gait.kind == kind and gait.direction == direction for gait in self.gaits)
+
     def nearest(self, kind: str, direction: int, slope: float) -> Gait:
         """The gait of the nearest slope.
 

@@ -134,6 +134,8 @@ class TaskSpec(Config):
     """Residual joint angle of one unit of action, rad."""
     shares: dict[str, float] = Field(default={"flat": 0.25, "rough": 0.05, "ramp": 0.14, "stairs": 0.42, "uturn": 0.14})
     """Share of the robots on each kind of terrain."""
+    explore: float = 0.3
+    """Share of the episodes on any level instead of the robot's own: steep stairs are tried before they are due."""
     forward: tuple[float, float] = (-0.5, 1.0)
     """Commanded forward velocity on the flat, m/s (forward limit P)."""
     lateral: float = 0.25

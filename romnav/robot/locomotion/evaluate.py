@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from romnav.progress import Progress
 from romnav.robot.g1 import Humanoids
 from romnav.robot.locomotion.lip import turn_xy, wrap
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
@@ -99,7 +100,7 @@ class Cycles:
 def run_row(
     row: Row, spec: LocomotionSpec, policy: Callable[[Tensor], Tensor], trials: int, seed: int, threads: int = 0
 ) -> dict[str, Any]:
-    """Run the trials of one row; see `evaluate`. `yaw_error`, rad/s, is returned as well."""
+    """Run the trials of one row; see `evaluate`."""
     random = torch.Generator().manual_seed(seed)
     ground = Ground(list(row.lanes))
     robots = Humanoids(spec.robot.model_copy(update={"friction": 0.8}), ground.boxes, trials, threads=threads)
@@ -169,7 +170,7 @@ def evaluate(
     seed: int = 0,
     threads: int = 0,
     only: tuple[str, ...] = (),
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
     """Test a checkpoint: deterministic policy, no pushes, friction 0.8, no payload.
 
@@ -184,19 +185,17 @@ def evaluate(
         seed: of speeds, headings and first feet.
         threads: of the physics; they do not change the result.
         only: terrains to run; all when empty.
-        progress: called with each finished row, which also has `yaw_error`, rad/s.
+        progress: told the rows done, their number, and the terrain.
 
     Returns:
-        Rows of `terrain`, `command`, `trials`, `crossed`, `fell`, `target` (shares from 0 to 1) and
-        `velocity_error` (mean over whole gait cycles, m/s).
+        Rows of `terrain`, `command`, `trials`, `crossed`, `fell`, `target` (shares from 0 to 1),
+        `velocity_error`, m/s, and `yaw_error`, rad/s (means over whole gait cycles).
     """
     spec, policy, _ = load_policy(checkpoint)
+    chosen = [row for row in rows() if not only or row.terrain in only]
     results = []
-    for row in rows():
-        if only and row.terrain not in only:
-            continue
-        result = run_row(row, spec, policy, trials, seed, threads)
+    for row in chosen:
+        results.append(run_row(row, spec, policy, trials, seed, threads))
         if progress:
-            progress(result)
-        results.append({key: value for key, value in result.items() if key != "yaw_error"})
+            progress(len(results), len(chosen), row.terrain)
     return results

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from romnav.robot.g1 import FOOT_LENGTH, SOLE, Humanoids
 from romnav.robot.locomotion.legs import Legs, rotation
-from romnav.robot.locomotion.terrain import HeightMap
+from romnav.robot.locomotion.terrain import Heights
 from romnav.robot.spec import GaitSpec
 
 GRAVITY = 9.81
@@ -157,7 +157,8 @@ class Walker:
         self.heading[ids] = heading
         self.joints[ids] = self.stance().expand(len(ids), 2, 6)
 
-    def _soles(self, robots: Humanoids) -> Tensor:
+    def soles(self, robots: Humanoids) -> Tensor:
+        """Centres (n, 2, 3) of the soles, left and right, world."""
         return robots.ankle + robots.ankle_rotation @ torch.tensor(SOLE)
 
     def _along(self, point: Tensor, heading: Tensor, offsets: Tensor) -> Tensor:
@@ -165,9 +166,7 @@ class Walker:
         ahead = torch.stack([torch.cos(heading), torch.sin(heading)], dim=-1)
         return point[:, None] + offsets[..., None] * ahead[:, None]
 
-    def _clear_of_edges(
-        self, ground: HeightMap, point: Tensor, heading: Tensor, reach: Tensor, level: Tensor
-    ) -> Tensor:
+    def _clear_of_edges(self, ground: Heights, point: Tensor, heading: Tensor, reach: Tensor, level: Tensor) -> Tensor:
         """Move footholds (n, 2) along the heading to where the ground under the sole is nearest to a plane, not
         more than a stair's riser from the `level` (n,) of the stance foot."""
         tries = torch.linspace(-1.0, 1.0, 15) * self.spec.edge_search
@@ -181,9 +180,7 @@ class Walker:
         best = (tries.abs() + 8.0 * (bump - 0.015).clamp(min=0.0) + 20.0 * climb).argmin(1)
         return self._along(point, heading, tries[best][:, None])[:, 0]
 
-    def update(
-        self, robots: Humanoids, command: Tensor, ground: HeightMap, *, first: Tensor | None = None
-    ) -> Reference:
+    def update(self, robots: Humanoids, command: Tensor, ground: Heights, *, first: Tensor | None = None) -> Reference:
         """The reference of this control step.
 
         Args:
@@ -208,7 +205,7 @@ class Walker:
         yaw = torch.atan2(robots.orientation[:, 1, 0], robots.orientation[:, 0, 0])
         lead = wrap(self.heading + turn * self.dt - yaw).clamp(-0.35, 0.35)
         self.heading = wrap(yaw + lead)
-        sole = self._soles(robots)
+        sole = self.soles(robots)
         # A foot that is late keeps aiming at its foothold until it touches the ground.
         self.planted = torch.where(
             start[:, None], torch.where(fresh[:, None], sole[rows, stance], self.foothold), self.planted
@@ -267,7 +264,7 @@ class Walker:
 
     def _inverse(
         self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, planted: Tensor,
-        foot: Tensor, height: Tensor, pull: Tensor, landing: Tensor, ground: HeightMap, reach: Tensor,
+        foot: Tensor, height: Tensor, pull: Tensor, landing: Tensor, ground: Heights, reach: Tensor,
     ) -> Tensor:  # fmt: skip
         """Leg joints: the swing foot placed from the pelvis as it is, the stance leg under the pelvis as wanted."""
         n = len(rows)

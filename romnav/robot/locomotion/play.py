@@ -7,8 +7,10 @@ from pathlib import Path
 import matplotlib
 import mujoco
 import numpy as np
+import pandas as pd
 import torch
 
+from romnav.errors import RomnavError
 from romnav.robot.g1 import Humanoids
 from romnav.robot.locomotion.evaluate import Row, rows
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
@@ -28,7 +30,7 @@ CHAINS = (
 
 
 def strip(checkpoint: Path, out: Path, *, seconds: float = 8.0, frames: int = 9, threads: int = 0) -> list[Path]:
-    """Write `out/<terrain>.png` for each terrain: side views at equal times, deterministic policy.
+    """Write `out/locomotion-<terrain>.png` for each terrain: side views at equal times, deterministic policy.
 
     Args:
         checkpoint: written by `train`.
@@ -39,6 +41,39 @@ def strip(checkpoint: Path, out: Path, *, seconds: float = 8.0, frames: int = 9,
     """
     out.mkdir(parents=True, exist_ok=True)
     return [_strip(row, checkpoint, out, seconds, frames, threads) for row in rows()]
+
+
+def curve(table: Path, path: Path) -> Path:
+    """Draw the levels and the shares of episodes ended by a fall, by kind of terrain, over the steps of a training.
+
+    Args:
+        table: curve.csv, written by `train`.
+        path: PNG to write.
+
+    Raises:
+        RomnavError: There is no curve.
+    """
+    if not table.exists():
+        raise RomnavError(f"{table}: no training curve; train with `romnav train locomotion`")
+    rows = pd.read_csv(table)
+    # Some hundred points: single iterations end only a few episodes of a kind.
+    rows = rows.groupby(np.arange(len(rows)) // max(1, len(rows) // 120)).mean()
+    figure, (levels, falls) = plt.subplots(1, 2, figsize=(11, 3.6))
+    for kind in [name.removeprefix("level/") for name in rows.columns if name.startswith("level/")]:
+        steps = rows["steps"] / 1e6
+        if kind != "flat":
+            levels.plot(steps, rows[f"level/{kind}"], label=kind)
+        falls.plot(steps, rows[f"fallen/{kind}"] / rows[f"ended/{kind}"].clip(lower=1e-9), label=kind)
+    levels.set_ylabel("mean level")
+    falls.set_ylabel("share of episodes that end in a fall")
+    for axis in (levels, falls):
+        axis.set_xlabel("million policy steps")
+        axis.legend(fontsize=8)
+        axis.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100, bbox_inches="tight")
+    plt.close(figure)
+    return path
 
 
 def _strip(row: Row, checkpoint: Path, out: Path, seconds: float, frames: int, threads: int) -> Path:
@@ -85,7 +120,7 @@ def _strip(row: Row, checkpoint: Path, out: Path, seconds: float, frames: int, t
     axis.set_aspect("equal")
     axis.set_title(f"{row.terrain}, iteration {iteration}, 0.5 m/s" + (": fell" if fell else ""))
     axis.set_xlabel("x, m")
-    path = out / f"{row.terrain}.png"
+    path = out / f"locomotion-{row.terrain}.png"
     figure.savefig(path, dpi=100, bbox_inches="tight")
     plt.close(figure)
     return path

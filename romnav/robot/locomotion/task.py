@@ -15,7 +15,7 @@ from romnav.robot.g1 import JOINTS, Humanoids
 from romnav.robot.locomotion.clf import Clf
 from romnav.robot.locomotion.legs import Legs
 from romnav.robot.locomotion.lip import Reference, Walker, turn_xy, wrap
-from romnav.robot.locomotion.terrain import Ground, HeightMap, Lane, steer
+from romnav.robot.locomotion.terrain import Ground, Heights, Lane, steer
 from romnav.robot.spec import LocomotionSpec
 
 SCAN = tuple((x, y) for y in (-0.15, 0.15) for x in np.linspace(-0.4, 1.0, 15))
@@ -63,7 +63,7 @@ class Controller:
         self.walker.reset(ids, clock, heading, start)
         self.action[ids] = 0.0
 
-    def refer(self, command: Tensor, ground: HeightMap, first: Tensor) -> Reference:
+    def refer(self, command: Tensor, ground: Heights, first: Tensor) -> Reference:
         """Reference of this control step, (n,) `first` for robots just placed."""
         self.reference = self.walker.update(self.robots, command, ground, first=first)
         return self.reference
@@ -75,7 +75,7 @@ class Controller:
         target[:, :12] += self.reference.joints.flatten(1) + self.reference.torque.flatten(1) / self.robots.kp[:12]
         self.robots.step(target, ids)
 
-    def observe(self, command: Tensor, ground: HeightMap) -> Tensor:
+    def observe(self, command: Tensor, ground: Heights) -> Tensor:
         """Observation (n, d) of the policy, mirrored (by `MIRROR`) while the right foot stands.
 
         The policy always sees itself standing on the left foot, so it is left-right symmetric by construction
@@ -247,6 +247,7 @@ class LocomotionEnv(VecEnv):
 
         n = t.robots
         self.level = torch.zeros(n, dtype=torch.long)
+        self.tried = torch.zeros(n, dtype=torch.long)
         self.lane = torch.zeros(n, dtype=torch.long)
         self.arc, self.start, self.forward, self.speed = (
             torch.zeros(n),
@@ -300,7 +301,10 @@ class LocomotionEnv(VecEnv):
         if k == 0:
             return
         t, g = self.spec.task, self.ground
-        self.lane[ids] = self._lane_table[self.kind[ids], self.level[ids]]
+        any_level = (self._uniform(0.0, 1.0, k) * (self._top[ids] + 1)).long()
+        own = self._uniform(0.0, 1.0, k) >= t.explore
+        self.tried[ids] = torch.where(own, self.level[ids], any_level)
+        self.lane[ids] = self._lane_table[self.kind[ids], self.tried[ids]]
         lane = self.lane[ids]
         pick = (self._uniform(0.0, 1.0, k) * g.spawn.shape[1]).long()
         arc = g.spawn[lane].gather(1, pick[:, None])[:, 0] + self._uniform(-0.4, 0.4, k)
@@ -427,7 +431,8 @@ class LocomotionEnv(VecEnv):
         time = self.episode_length_buf[ids] * self.dt
         quick = covered > 0.66 * self.speed[ids] * time
         part = covered / self.ground.length[self.lane[ids]]
-        up, down = (part > 0.45) & quick, fell[ids] & (part < 0.3)
+        own = self.tried[ids] == self.level[ids]
+        up, down = own & (part > 0.45) & quick, own & fell[ids] & (part < 0.3)
         level = self.level[ids] + up.long() - down.long()
         top = self._top[ids]
         # Beyond the top, practise all levels.
@@ -445,6 +450,7 @@ class LocomotionEnv(VecEnv):
         """Everything that decides the future of the run."""
         names = (
             "level",
+            "tried",
             "lane",
             "arc",
             "start",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -11,6 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav.robot.g1 import Boxes
+
+
+class Heights(Protocol):
+    """Walking surfaces under ``n`` robots."""
+
+    def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
+        """Height (n, ...) of the highest surface not above `reach` (n, ...) under points (n, ..., 2), m."""
+        ...
 
 
 class HeightMap(NamedTuple):

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.errors import RomnavError
+from romnav.progress import Progress
 from romnav.robot.locomotion.task import LocomotionEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.spec import LocomotionSpec, PpoSpec
@@ -104,6 +105,14 @@ def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor],
     return spec, policy, saved["iteration"]
 
 
+def training_cost(path: Path) -> dict[str, Any]:
+    """Iterations, policy steps and hours that a checkpoint cost."""
+    saved = torch.load(path, map_location="cpu", weights_only=False)
+    spec = saved["spec"]
+    steps = saved["iteration"] * spec["ppo"]["steps"] * spec["task"]["robots"]
+    return {"iterations": saved["iteration"], "steps": steps, "hours": round(saved["seconds"] / 3600, 3)}
+
+
 def _save(path: Path, spec: LocomotionSpec, ppo: PPO, env: LocomotionEnv, iteration: int, seconds: float) -> None:
     state = {
         "spec": spec.model_dump(), "iteration": iteration, "seconds": seconds, "ppo": ppo.save(),
@@ -120,7 +129,7 @@ def train(
     *,
     device: str = "cpu",
     resume: bool = True,
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    progress: Progress | None = None,
     threads: int = 0,
     save_every: float = 60.0,
 ) -> Path:
@@ -131,7 +140,7 @@ def train(
         out: directory.
         device: only "cpu" has an engine.
         resume: continue from `out/policy.pt` where it exists; the result equals the run that was not interrupted.
-        progress: called with each iteration's row.
+        progress: told the iteration, their number, and reward per step and falls per second of a robot.
         threads: of the physics; 0 means all cores. They do not change the result.
         save_every: seconds between checkpoints.
 
@@ -182,7 +191,7 @@ def train(
         } | losses  # fmt: skip
         _append(out / "curve.csv", row, fresh=iteration == 1)
         if progress:
-            progress(row)
+            progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
         if time.monotonic() - mark > save_every or iteration == spec.iterations:
             mark = time.monotonic()
             _save(path, spec, ppo, env, iteration, row["seconds"])

@@ -74,16 +74,21 @@ def test_levels_follow_the_distance_along_the_path() -> None:
     ids = stair.nonzero()[:, 0]
     env.start[ids], env.arc[ids], env.speed[ids] = 0.8, 3.8, 0.5
     env.episode_length_buf[ids] = 300
+    env.level[ids] = env.tried[ids] = 0
     env._promote(ids, torch.zeros(8, dtype=torch.bool), stair)
     assert (env.level[ids] == 1).all()
     env.level[ids] = 0
     env.episode_length_buf[ids] = 900
     env._promote(ids, torch.zeros(8, dtype=torch.bool), stair)
     assert (env.level[ids] == 0).all(), "arriving late does not count"
-    env.level[ids] = 1
+    env.level[ids] = env.tried[ids] = 1
     env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
     assert (env.level[ids] == 1).all(), "a fall after most of the way is no reason to go down"
     env.arc[ids] = 1.6
+    env.tried[ids] = 0
+    env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
+    assert (env.level[ids] == 1).all(), "what happens on another level says nothing about this one"
+    env.tried[ids] = 1
     env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
     assert (env.level[ids] == 0).all()
 

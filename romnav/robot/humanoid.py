@@ -1,0 +1,193 @@
+"""The humanoid as the `Dynamics` of the navigation task: the frozen locomotion policy under velocity commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from romnav import random
+from romnav.errors import RomnavError
+from romnav.robot.g1 import Humanoids, build_spec
+from romnav.robot.gaits import GaitLibrary
+from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
+from romnav.robot.locomotion.train import load_policy
+from romnav.robot.tiles import TileGeoms, TileHeights
+from romnav.world.solids import Label
+from romnav.world.spawns import Start
+from romnav.world.world import World
+
+STEP_UP = 0.3
+"""The surface that a robot is over lies at most this far above its lower foot, m."""
+FOOTING = 0.35
+"""Distance from the side of a stair or ramp within which nobody is put on it, m."""
+_CLOCK, _FRAME = range(2)
+
+
+class Humanoid:
+    """``E`` robots on the tiles of a world, each in a MuJoCo model of its tile; the `Dynamics` of the humanoid stage.
+
+    A start on a stair or ramp takes a state out of the gait library, walking up or down, whichever is nearer to
+    the start's heading; where the library has none, the robot stands on the slope in that heading.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        envs: int,
+        period: float,
+        checkpoint: Path,
+        gaits: GaitLibrary,
+        *,
+        seed: int = 0,
+        threads: int = 0,
+    ) -> None:
+        """
+        Args:
+            world: on the CPU.
+            envs: number of robots.
+            period: of a command, s; a multiple of the control step, 20 ms.
+            checkpoint: of the locomotion policy.
+            gaits: recorded from it.
+            seed: of first feet and times along gaits.
+            threads: of the physics; 0 means all cores. They do not change the result.
+
+        Raises:
+            RomnavError: the checkpoint is missing, or the period is no multiple of the control step.
+        """
+        self.world, self.period, self.gaits, self.seed, self.threads = world, period, gaits, seed, threads
+        self._spec, self._policy, _ = load_policy(checkpoint)
+        self._geoms = TileGeoms.of(world.tiles)
+        self._models: dict[int, mujoco.MjModel] = {}
+        self._heights = TileHeights(world.tiles)
+        self.tile = torch.zeros(envs, dtype=torch.int64)
+        self.layer = torch.zeros(envs, dtype=torch.int64)
+        self.position = torch.zeros(envs, 3)
+        self.yaw = torch.zeros(envs)
+        self.contacts = torch.zeros(envs)
+        self.fallen = torch.zeros(envs, dtype=torch.bool)
+        self._env = torch.arange(envs)
+        self._resets = torch.zeros(envs, dtype=torch.int64)
+        self._first = torch.ones(envs, dtype=torch.bool)
+        self.robots = self._batch(envs)
+        self.control = Controller(self._spec, self.robots)
+        self._ticks = round(period / self.control.dt)
+        if abs(self._ticks * self.control.dt - period) > 1e-9:
+            raise RomnavError(f"period {period} s: no multiple of the control step, {self.control.dt} s")
+
+    def _batch(self, envs: int) -> Humanoids:
+        return Humanoids(self._spec.robot, self._geoms[0], envs, threads=self.threads)
+
+    def _model(self, tile: int) -> mujoco.MjModel:
+        if tile not in self._models:
+            self._models[tile] = build_spec(self._spec.robot, self._geoms[tile]).compile()
+        return self._models[tile]
+
+    def _enter_tiles(self) -> None:
+        self.robots.stand_on([self._model(t) for t in self.tile.tolist()])
+        self._heights.place(self.tile)
+
+    def reset(self, envs: Tensor, start: Start) -> None:
+        """Put the robots ``envs`` (K,) at their starts."""
+        self.tile[envs], self.layer[envs] = start.tile, start.layer
+        self._enter_tiles()
+        self._resets[envs] += 1
+        z = self.world.surface(start.tile, start.layer, start.xy)
+        clock = self._draw(envs, _CLOCK, 2) * self._spec.gait.step_ticks
+        still = torch.zeros(len(envs), 3)
+        self.control.stand(envs, torch.cat([start.xy, z[:, None]], dim=1), start.yaw, clock, still)
+        self._first[envs] = True
+        for k in range(len(envs)):
+            self._put_on_slope(envs[k : k + 1], int(start.tile[k]), start.xy[k].numpy(), float(z[k]), start.yaw[k])
+        self.contacts[envs], self.fallen[envs] = 0.0, False
+        self._read()
+
+    def _draw(self, envs: Tensor, purpose: int, high: int) -> Tensor:
+        return random.integers(high, self.seed, self._env[envs], self._resets[envs], purpose)
+
+    def _put_on_slope(self, env: Tensor, tile: int, xy: np.ndarray, z: float, yaw: Tensor) -> None:
+        """If the start is on a stair or ramp, walk there already: on the middle of a tread, along the flight."""
+        solids = self.world.tiles[tile].solids
+        (u,), (v,) = (part.T for part in solids.local(xy[None]))
+        top = solids.top + solids.slope_top * u
+        slope = np.isin(solids.label, (Label.STAIR, Label.RAMP)) & solids.walkable & (np.abs(top - z) < 0.02)
+        on = np.flatnonzero(slope & (np.abs(u) <= solids.half[:, 0]) & (np.abs(v) <= solids.half[:, 1]))
+        found = self._flight(tile, xy, z)
+        if len(on) == 0 or found is None:
+            return
+        step, (along, steepness) = on[0], found
+        kind = "ramp" if solids.label[step] == Label.RAMP else "stair"
+        forward = 1.0 if np.cos(float(yaw) - along) >= 0 else -1.0
+        side = max(solids.half[step, 1] - FOOTING, 0.0)
+        at_u, at_v = (u[step] if kind == "ramp" else 0.0), np.clip(v[step], -side, side)
+        c, s = np.cos(solids.yaw[step]), np.sin(solids.yaw[step])
+        x, y = solids.centre[step] + at_u * np.array([c, s]) + at_v * np.array([-s, c])
+        anchor = torch.tensor([[x, y, solids.top[step] + solids.slope_top[step] * at_u]], dtype=torch.float32)
+        heading = torch.tensor([along if forward > 0 else along + np.pi], dtype=torch.float32)
+        if not self.gaits.has(kind, int(forward)):
+            clock = self._draw(env, _CLOCK, 2) * self._spec.gait.step_ticks
+            self.control.stand(env, anchor, heading, clock, torch.zeros(1, 3))
+            return
+        gait = self.gaits.nearest(kind, int(forward), steepness)
+        self.gaits.place(self.control, env, gait, self._draw(env, _FRAME, len(gait)), anchor, heading)
+        self._first[env] = False
+
+    def _flight(self, tile: int, xy: np.ndarray, z: float) -> tuple[float, float] | None:
+        """Heading uphill, rad, and rise over run of the connector's piece that passes nearest to a point."""
+        best, found = np.inf, None
+        for connector in self.world.tiles[tile].connectors:
+            for a, b in zip(connector.path[:-1], connector.path[1:], strict=True):
+                run, rise = b[:2] - a[:2], b[2] - a[2]
+                length = float(np.hypot(*run))
+                if rise == 0.0 or length == 0.0:
+                    continue
+                t = float(np.clip((xy - a[:2]) @ run / length**2, 0.0, 1.0))
+                away = np.hypot(*(a[:2] + t * run - xy)) + abs(a[2] + t * rise - z)
+                if away < best:
+                    best, up = away, run * np.sign(rise)
+                    found = float(np.arctan2(up[1], up[0])), abs(rise) / length
+        return found
+
+    @torch.no_grad()
+    def step(self, command: Tensor) -> None:
+        """Walk under the command (E, 3) for one period; who has fallen stays down."""
+        touched = torch.zeros_like(self.robots.touch)
+        for _ in range(self._ticks):
+            self.control.refer(command, self._heights, self._first)
+            action = self._policy(self.control.observe(command, self._heights))
+            self.control.act(action, (~self.fallen).nonzero()[:, 0])
+            self._first = torch.zeros_like(self._first)
+            touched |= self.robots.touch
+            self.fallen = self.fallen | has_fallen(self.robots)
+        touched[:, self.robots.feet] = False
+        self.contacts = touched.sum(1).float()
+        self._read()
+
+    def _read(self) -> None:
+        """Poses and layers from the physics."""
+        xy = self.robots.pelvis[:, :2]
+        reach = self.control.walker.soles(self.robots)[..., 2].amin(1) + STEP_UP
+        z = self._heights(xy, reach)
+        self.position = torch.cat([xy, z[:, None]], dim=1)
+        self.yaw = heading_of(self.robots.orientation)
+        world = self.world
+        up = (z > world.switch[self.tile, self.layer + 1]).long()
+        down = (z <= world.switch[self.tile, self.layer]).long()
+        layer = self.layer + up - down
+        exists = world.surface(self.tile, layer.clamp(0, world.height.shape[1] - 1), xy).isfinite()
+        self.layer = torch.where(exists, layer, self.layer)
+
+    def select(self, envs: Tensor) -> None:
+        """Keep only the robots ``envs`` (K,), in that order."""
+        state, walking = self.robots.state_dict(), self.control.snapshot(envs)
+        for name in ("tile", "layer", "position", "yaw", "contacts", "fallen", "_env", "_resets", "_first"):
+            setattr(self, name, getattr(self, name)[envs])
+        self.robots = self._batch(len(envs))
+        self.control = Controller(self._spec, self.robots)
+        self._enter_tiles()
+        self.control.restore(torch.arange(len(envs)), walking)
+        # After `restore`, which forgets contacts and the solver's warm start.
+        self.robots.load_state_dict({name: value[envs.numpy()] for name, value in state.items()})

@@ -1,0 +1,147 @@
+"""The humanoid under navigation commands: where it starts, that it walks, falls, and is dropped from a batch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from romnav.errors import RomnavError
+from romnav.robot.gaits import GaitLibrary
+from romnav.robot.humanoid import Humanoid
+from romnav.robot.locomotion.train import train
+from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+from romnav.world.solids import Label
+from romnav.world.spawns import Start
+from romnav.world.spec import WorldSpec
+from romnav.world.world import World, build
+
+SPEC = LocomotionSpec(
+    task=TaskSpec(robots=4, shares={"flat": 1.0}), ppo=PpoSpec(steps=2, epochs=1, minibatches=1), iterations=1
+)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that has learned nothing: its residuals are almost zero, so the reference gait walks alone."""
+    return train(SPEC, tmp_path_factory.mktemp("locomotion"), threads=1)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return build(WorldSpec(tiles=2, goals_per_tile=2, classes=("building", "outdoor")))
+
+
+def starts(world: World, nodes: torch.Tensor, yaw: torch.Tensor) -> Start:
+    tile = (torch.searchsorted(world.node_start, nodes, right=True) - 1).long()
+    zero = torch.zeros_like(nodes)
+    return Start(tile, world.layer[nodes], world.position[nodes, :2], yaw, zero, torch.zeros_like(yaw))
+
+
+def level_nodes(world: World, count: int) -> torch.Tensor:
+    """Nodes of tile 0 with level free ground for 0.6 m around them."""
+    chosen = []
+    for n in range(int(world.node_start[0]), int(world.node_start[1]), 7):
+        around = world.position[n, :2] + 0.6 * torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
+        four = torch.zeros(4, dtype=torch.long)
+        layer = four + world.layer[n]
+        if (world.node_at(four, layer, around) >= 0).all():
+            z = world.surface(four, layer, around)
+            if (z - world.position[n, 2]).abs().max() < 1e-3:
+                chosen.append(n)
+    return torch.tensor(chosen)[torch.linspace(0, len(chosen) - 1, count).long()]
+
+
+def robot(world: World, count: int, checkpoint: Path) -> Humanoid:
+    return Humanoid(world, count, 0.2, checkpoint, GaitLibrary([]), threads=1)
+
+
+def test_it_walks_where_it_is_told_from_every_storey(world: World, checkpoint: Path) -> None:
+    body = robot(world, 4, checkpoint)
+    start = starts(world, level_nodes(world, 4), torch.tensor([0.0, 1.5, 3.0, -1.5]))
+    body.reset(torch.arange(4), start)
+    torch.testing.assert_close(body.position[:, :2], start.xy, atol=1e-3, rtol=0)
+    torch.testing.assert_close(body.yaw, start.yaw, atol=1e-3, rtol=0)
+    z = body.position[:, 2]
+    torch.testing.assert_close(z, world.surface(start.tile, start.layer, start.xy), atol=2e-3, rtol=0)
+    assert z.max() - z.min() > 3.0
+    for _ in range(8):
+        body.step(torch.tensor([[0.25, 0.0, 0.0]]).expand(4, -1))
+    move = body.position[:, :2] - start.xy
+    ahead = (move * torch.stack([torch.cos(start.yaw), torch.sin(start.yaw)], dim=1)).sum(1)
+    assert (ahead > 0.08).all()
+    assert not body.fallen.any()
+    assert (body.contacts == 0).all()
+    assert (body.layer == start.layer).all()
+
+
+def test_dropping_robots_changes_nothing_for_the_others(world: World, checkpoint: Path) -> None:
+    whole, part = robot(world, 4, checkpoint), robot(world, 4, checkpoint)
+    start = starts(world, level_nodes(world, 4), torch.zeros(4))
+    command = torch.tensor([[0.3, 0.0, 0.4]])
+    for body in (whole, part):
+        body.reset(torch.arange(4), start)
+        body.step(command.expand(4, -1))
+    keep = torch.tensor([3, 1])
+    part.select(keep)
+    for _ in range(3):
+        whole.step(command.expand(4, -1))
+        part.step(command.expand(2, -1))
+    # Vectorised arithmetic rounds otherwise in a batch of another size.
+    torch.testing.assert_close(part.position, whole.position[keep], atol=1e-4, rtol=0)
+    torch.testing.assert_close(part.yaw, whole.yaw[keep], atol=1e-4, rtol=0)
+
+
+def test_a_start_on_a_stair_faces_along_it_on_the_middle_of_a_tread(world: World, checkpoint: Path) -> None:
+    body = robot(world, 2, checkpoint)
+    solids = world.tiles[0].solids
+    on_stair = [
+        n for n in world.spawn[world.spawn < world.node_start[1]].tolist()
+        if any(
+            solids.label[i] == Label.STAIR and abs(solids.top[i] - float(world.position[n, 2])) < 0.01
+            for i in _over(solids, world.position[n, :2].numpy())
+        )
+    ]  # fmt: skip
+    nodes = torch.tensor(on_stair[:1] * 2)
+    start = starts(world, nodes, torch.tensor([0.3, 0.3 + np.pi]))
+    body.reset(torch.arange(2), start)
+    xy, z = body.position[:, :2].numpy(), body.position[:, 2]
+    torch.testing.assert_close(z, world.position[nodes, 2], atol=0.01, rtol=0)
+    tread = next(i for i in _over(solids, xy[0]) if solids.label[i] == Label.STAIR and abs(solids.top[i] - z[0]) < 0.01)
+    (u,), _ = (part.T for part in solids.local(xy[:1]))
+    assert abs(u[tread]) < 0.01
+    assert torch.cos(body.yaw[0] - body.yaw[1]) < -0.99
+    ahead = xy[0] + 0.5 * np.array([np.cos(float(body.yaw[0])), np.sin(float(body.yaw[0]))])
+    assert abs(np.sin(2 * (float(body.yaw[0]) - solids.yaw[tread]))) < 1e-3
+    there = world.surface(start.tile[:1], start.layer[:1], torch.tensor(ahead[None], dtype=torch.float32))
+    assert there.isnan() or abs(float(there) - float(z[0])) > 0.05, "up or down within half a metre"
+
+
+def _over(solids: object, xy: np.ndarray) -> list[int]:
+    (u,), (v,) = (part.T for part in solids.local(xy[None]))  # type: ignore[attr-defined]
+    return np.flatnonzero((np.abs(u) <= solids.half[:, 0]) & (np.abs(v) <= solids.half[:, 1])).tolist()  # type: ignore[attr-defined]
+
+
+def test_who_has_fallen_is_reported_and_stays_down(world: World, checkpoint: Path) -> None:
+    body = robot(world, 2, checkpoint)
+    start = starts(world, level_nodes(world, 2), torch.zeros(2))
+    body.reset(torch.arange(2), start)
+    lying = body.control.snapshot(torch.tensor([1]))
+    lying["qpos"][:, 2] = float(body.position[1, 2]) + 0.2
+    lying["qpos"][:, 3:7] = torch.tensor([[0.7071, 0.7071, 0.0, 0.0]])
+    body.control.restore(torch.tensor([1]), lying)
+    body.step(torch.zeros(2, 3))
+    assert body.fallen.tolist() == [False, True]
+    assert body.contacts[0] == 0
+    there = body.position[1].clone()
+    body.step(torch.zeros(2, 3))
+    torch.testing.assert_close(body.position[1], there, atol=0, rtol=0)
+    body.reset(torch.tensor([1]), starts(world, level_nodes(world, 2)[1:], torch.zeros(1)))
+    assert not body.fallen.any()
+
+
+def test_the_period_is_a_multiple_of_the_control_step(world: World, checkpoint: Path) -> None:
+    with pytest.raises(RomnavError, match="multiple of the control step"):
+        Humanoid(world, 1, 0.19, checkpoint, GaitLibrary([]), threads=1)

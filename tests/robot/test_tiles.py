@@ -1,0 +1,67 @@
+"""Tiles under the humanoid: geoms and heights against each other, and one layout for all tiles."""
+
+from __future__ import annotations
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import pytest
+import torch
+
+from romnav.robot.g1 import build_spec
+from romnav.robot.spec import RobotSpec
+from romnav.robot.tiles import CELL, TileGeoms, TileHeights
+from romnav.world.spec import WorldSpec
+from romnav.world.tile import Tile
+from romnav.world.tiles import generate
+
+SPEC = WorldSpec(tiles=3, goals_per_tile=2)
+
+
+@pytest.fixture(scope="module")
+def tiles() -> list[Tile]:
+    return [generate(SPEC, i)[0] for i in range(3)]
+
+
+def test_rays_hit_the_ground_at_the_heights_of_the_map(tiles: list[Tile]) -> None:
+    """MuJoCo's ray cast of the geoms is one view of the solids, the rasterised height map another."""
+    rng = np.random.default_rng(0)
+    checked = 0
+    for t, tile in enumerate(tiles):
+        walkable = tile.solids[tile.solids.walkable]
+        model = mujoco.MjSpec()
+        model.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+        TileGeoms(walkable, len(walkable), len(walkable)).add_to(model)
+        compiled = model.compile()
+        data = mujoco.MjData(compiled)
+        mujoco.mj_forward(compiled, data)
+        cells = rng.integers(0, round(tile.side / CELL), (300, 2))
+        points = torch.tensor((cells + 0.5) * CELL, dtype=torch.float32)
+        heights = TileHeights(tuple(tiles))
+        heights.place(torch.full((300,), t))
+        mapped = heights(points, torch.full((300,), 99.0))
+        for (x, y), height in zip((cells + 0.5) * CELL, mapped.tolist(), strict=True):
+            far = mujoco.mj_ray(compiled, data, [x, y, 50.0], [0, 0, -1.0], None, 1, -1, np.zeros(1, np.int32))
+            assert 50.0 - far == pytest.approx(height, abs=2e-3)
+            checked += height > 0.05
+    assert checked > 50
+
+
+def test_the_reach_chooses_the_storey(tiles: list[Tile]) -> None:
+    tile = next(tile for tile in tiles if tile.multi_story)
+    heights = TileHeights(tuple(tiles))
+    t = torch.tensor([tiles.index(tile)] * 4000)
+    heights.place(t)
+    points = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0)) * tile.side
+    high, low = heights(points, torch.full((4000,), 99.0)), heights(points, torch.full((4000,), 0.5))
+    assert (low <= 0.5).all()
+    assert (high[high > 0.5] > low[high > 0.5]).all()
+    assert (high > 3.0).any()
+
+
+def test_robots_of_one_batch_stand_on_different_tiles(tiles: list[Tile]) -> None:
+    models = [build_spec(RobotSpec(), geoms).compile() for geoms in TileGeoms.of(tiles)]
+    batch = mujoco.batch.Batch(models[0], 3, 1, persistent=True)
+    batch.set_models(models)
+    batch.step()
+    assert np.isfinite(batch.bind("qpos")).all()
