@@ -71,7 +71,20 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
     assert min(times) < 0.4  # s of processor time: the same on a busy machine
 
 
-@pytest.mark.parametrize("words", [[], ["run"], ["run", "ablation"], ["train"], ["eval"], ["play", "world"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["run"],
+        ["run", "ablation"],
+        ["train"],
+        ["train", "locomotion"],
+        ["train", "gaits"],
+        ["eval"],
+        ["play", "world"],
+        ["play", "locomotion"],
+    ],
+)
 def test_every_command_explains_itself(words: list[str]) -> None:
     result = romnav(*words, "--help")
     assert result.exit_code == 0
@@ -115,6 +128,34 @@ def test_a_wrong_specification_names_file_and_key(project: Path, file: str, old:
     edit(project / "experiments" / file, old, new)
     assert fails("run", "ablation", "spawn-goal").startswith(f"{project / 'experiments' / file}: {message}")
     assert not (project / "results").exists()
+
+
+def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> None:
+    folder = project / "results" / "smoke" / "locomotion"
+    assert fails("eval", "locomotion") == (
+        f"{folder}: no locomotion policy; train one with `romnav train locomotion --scale smoke`"
+    )
+    assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no locomotion policy; train one with")
+
+
+@pytest.mark.slow
+def test_locomotion_is_trained_continued_and_recorded(project: Path) -> None:
+    edit(project / "experiments" / "scales" / "smoke.toml", "iterations = 60", "iterations = 1")
+    edit(project / "experiments" / "scales" / "smoke.toml", "robots = 128", "robots = 16")
+    assert romnav("train", "locomotion").exit_code == 0
+    assert "nothing to do" in romnav("train", "locomotion").stderr
+    record = json.loads((project / "results" / "smoke" / "locomotion" / "policy.json").read_text())
+    assert record["facts"]["iterations"] == 1
+    edit(project / "experiments" / "scales" / "smoke.toml", "iterations = 1 ", "iterations = 2 ")
+    assert romnav("train", "locomotion").exit_code == 0
+    curve = (project / "results" / "smoke" / "locomotion" / "curve.csv").read_text().splitlines()
+    assert len(curve) == 3
+    assert romnav("play", "locomotion").exit_code == 0
+    assert (project / "results" / "smoke" / "figures" / "locomotion-stairs-low.png").stat().st_size > 1000
+    edit(project / "experiments" / "scales" / "smoke.toml", "robots = 16", "robots = 32")
+    refused = romnav("train", "locomotion")
+    assert refused.exit_code == 1
+    assert "trained by another specification; use another directory or --no-resume" in refused.stderr
 
 
 def test_outside_of_a_project_there_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
