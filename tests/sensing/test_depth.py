@@ -63,7 +63,7 @@ def cast(solids: Solids, origin: NDArray, rays: NDArray) -> tuple[NDArray, NDArr
 @pytest.mark.parametrize(("seed", "tilt"), [(0, (0.0, 0.0)), (1, (0.15, -0.2)), (2, (-0.1, 0.3))])
 def test_depth_is_that_of_the_exact_mesh(seed: int, tilt: tuple[float, float]) -> None:
     solids, origin, yaw = scene(seed), np.array([4.0, 4.0, 1.9]), 0.7 + seed
-    camera = DepthCamera([scene(9), solids], DepthSpec(rows=13, columns=15))
+    camera = DepthCamera([scene(9), solids], SPEC)
     depth, labels = camera.scan(
         torch.tensor([1]), torch.tensor(origin)[None], torch.tensor([yaw]), labels=True, tilt=torch.tensor([tilt])
     )
