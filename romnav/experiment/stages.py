@@ -135,11 +135,13 @@ class Stages:
 
     def gaits(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Records the gait library of the locomotion policy."""
-        from romnav.robot.gaits import record
+        from romnav.robot.gaits import record, still_up
 
-        library = record(stage.upstream[0].folder / "policy.pt")
+        policy = stage.upstream[0].folder / "policy.pt"
+        library = record(policy)
         library.save(stage.folder / "gaits.pt")
-        return {"gaits": len(library.gaits)}
+        gaits = [f"{'up' if g.direction > 0 else 'down'} {g.kind} {g.slope:.2f}" for g in library.gaits]
+        return {"gaits": gaits, "still_up_after_3_s": still_up(policy, library) if gaits else None}
 
     def policy(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Trains the policy of an arm."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -168,6 +169,65 @@ def record(checkpoint: Path, *, per_slope: int = 4, threads: int = 0) -> GaitLib
         if all((g.kind, g.direction, g.slope) != _label(lanes, *shape) for g in gaits):
             gaits.append(_cut(lanes, ground, *shape, {k: v[:, i] for k, v in states.items()}, stance[:, i]))
     return GaitLibrary(gaits)
+
+
+def still_up(
+    checkpoint: Path, library: GaitLibrary, *, trials: int = 400, seconds: float = 3.0, seed: int = 0, threads: int = 0
+) -> float:
+    """Share of robots still up after walking on from a state of the library, where episodes would take it from.
+
+    Each is put at a random time of the nearest gait on a random tread of a flight or ramp whose slope is not in the
+    library, and walks on under the standard command.
+
+    Args:
+        checkpoint: of the policy.
+        library: recorded from it.
+        trials: robots, spread over slopes and directions that the library has.
+        seconds: of walking.
+        seed: of treads and times.
+        threads: of the physics.
+
+    Raises:
+        RomnavError: the library is empty.
+    """
+    spec, policy, _ = load_policy(checkpoint)
+    shapes = ((0.11, 0.31), (0.13, 0.28), (0.15, 0.30), (0.17, 0.27))
+    lanes = [stairs(i, riser, tread, tread, 20) for i, (riser, tread) in enumerate(shapes)]
+    lanes += [ramp(i, degrees, 6.0) for i, degrees in enumerate((6.5, 9.5, 12.5))]
+    known = [way for way in itertools.product(range(len(lanes)), (1, -1)) if library.has(*_label(lanes, *way)[:2])]
+    if not known:
+        raise RomnavError("gait library: empty; record it with a policy that crosses stairs or ramps")
+    ground = Ground(lanes)
+    robots = Humanoids(spec.robot, ground.boxes, trials, threads=threads)
+    control = Controller(spec, robots)
+    random = torch.Generator().manual_seed(seed)
+    index, lane, start = torch.arange(trials), torch.zeros(trials, dtype=torch.long), torch.zeros(trials)
+    for i, where, when in zip(
+        index, torch.rand(trials, generator=random), torch.rand(trials, generator=random), strict=True
+    ):
+        which, direction = known[int(i) % len(known)]
+        kind, _, slope = _label(lanes, which, direction)
+        slabs = _flight(lanes[which], direction)
+        if kind == "stair":
+            slab = slabs[int(where * (len(slabs) - 7))]
+            x, z = (slab.x0 + slab.x1) / 2, slab.z0
+        else:
+            part = 0.1 + 0.5 * float(where)
+            x, z = slabs[0].x0 + part * (slabs[0].x1 - slabs[0].x0), slabs[0].z0 + part * (slabs[0].z1 - slabs[0].z0)
+        gait = library.nearest(kind, direction, slope)
+        anchor = torch.tensor([[x, float(ground.path[which, 0, 1]), z]])
+        library.place(control, i[None], gait, (when * len(gait)).long()[None], anchor, torch.zeros(1))
+        lane[i], start[i] = which, x
+    arc, forward, speed = start, torch.ones(trials), torch.full((trials,), COMMAND)
+    fell = torch.zeros(trials, dtype=torch.bool)
+    for _ in range(round(seconds / control.dt)):
+        xy = robots.pelvis[:, :2]
+        arc = ground.project(lane, xy, arc)
+        command = steer(ground, lane, arc, forward, xy, heading_of(robots.orientation), speed)
+        control.refer(command, ground.map, torch.zeros(trials, dtype=torch.bool))
+        control.act(policy(control.observe(command, ground.map)), (~fell).nonzero()[:, 0])
+        fell |= has_fallen(robots)
+    return 1.0 - fell.float().mean().item()
 
 
 def _flight(lane: Lane, direction: int) -> list[Slab]:
