@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
+from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
 import mujoco
@@ -165,11 +166,8 @@ def _single(array: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(array.astype(np.float32))
 
 
-class Humanoids:
-    """A batch of G1 robots, each alone on the ground, stepped by native MuJoCo on all cores.
-
-    All stand on the same ground unless `stand_on` gives each its own. Results do not depend on the number of
-    threads. Tensors are float32 copies of MuJoCo's float64 state.
+class Robots(ABC):
+    """A batch of G1 robots, each alone on the ground, whatever engine moves them. Tensors are float32.
 
     Attributes:
         pelvis, orientation, velocity, spin: (n, 3) position, (n, 3, 3) rotation, (n, 3) world linear and
@@ -179,12 +177,12 @@ class Humanoids:
         ankle, ankle_rotation: (n, 2, 3), (n, 2, 3, 3) of the ankle-roll bodies, left and right, world.
         anchor, axis: (n, 15, 3) joint anchors and axes, world.
         touch: (n, bodies) whether each collision body is in contact; `feet` are the columns of the feet.
+        torque: (n, 15) of the actuators, N m.
     """
 
-    def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
+    def __init__(self, spec: RobotSpec, ground: Statics, count: int) -> None:
         self.spec, self.count = spec, count
         self.model = build_spec(spec, ground).compile()
-        self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
         self.kp = torch.tensor(self.model.actuator_gainprm[:, 0], dtype=torch.float32)
         self.mass = float(self.model.body_subtreemass[1])
         self.joint_range = torch.tensor(self.model.jnt_range[1:], dtype=torch.float32)
@@ -197,12 +195,50 @@ class Humanoids:
         self._com_velocity = int(self.model.sensor("com_velocity").adr[0])
         self.feet = [self.touch_names.index(f"{side}_ankle_roll_link") for side in SIDES]
         self._ankles = [self.model.body(f"{side}_ankle_roll_link").id for side in SIDES]
+        self.touch = torch.zeros(count, len(touch), dtype=torch.bool)
+        self.torque = torch.zeros(count, len(JOINTS))
+
+    @abstractmethod
+    def _field(self, name: str) -> Tensor:
+        """A float32 copy (n, ...) of a field of MuJoCo's data."""
+
+    def _read(self) -> None:
+        qpos, qvel, xmat, xpos = (self._field(name) for name in ("qpos", "qvel", "xmat", "xpos"))
+        self.pelvis, self.joints = qpos[:, :3], qpos[:, 7:]
+        self.velocity, self.spin, self.joint_velocity = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
+        self.orientation = xmat[:, 1].reshape(-1, 3, 3)
+        self.com = self._field("subtree_com")[:, 1]
+        self.com_velocity = self._field("sensordata")[:, self._com_velocity : self._com_velocity + 3]
+        self.ankle, self.ankle_rotation = xpos[:, self._ankles], xmat[:, self._ankles].reshape(-1, 2, 3, 3)
+        self.anchor, self.axis = self._field("xanchor")[:, 1:], self._field("xaxis")[:, 1:]
+
+    @abstractmethod
+    def step(self, target: Tensor, ids: Tensor | None = None) -> None:
+        """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms); all, or only `ids`."""
+
+    @abstractmethod
+    def set_state(self, ids: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """Put robots `ids` into states (k, 22) and (k, 21); they touch nothing until they are stepped."""
+
+    @abstractmethod
+    def state(self, ids: Tensor) -> tuple[Tensor, Tensor]:
+        """States (k, 22) and (k, 21) of robots `ids`, as precise as the engine has them."""
+
+
+class Humanoids(Robots):
+    """`Robots` stepped by native MuJoCo on all cores, in float64.
+
+    All stand on the same ground unless `stand_on` gives each its own. Results do not depend on the number of
+    threads.
+    """
+
+    def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
+        super().__init__(spec, ground, count)
+        self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
         for field in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             self.batch.bind(field)
         for field in ("xpos", "xmat", "subtree_com", "xanchor", "xaxis", "sensordata", "actuator_force"):
             self.batch.bind(field)
-        self.touch = torch.zeros(count, len(touch), dtype=torch.bool)
-        self.torque = torch.zeros(count, len(JOINTS))
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         self._read()
 
@@ -210,17 +246,13 @@ class Humanoids:
         """Give every robot the model it is in from now on, of `build_spec` with as many geoms as this one's."""
         self.batch.set_models(models)
 
-    def _read(self) -> None:
-        b = self.batch
-        qpos, qvel = _single(b.qpos), _single(b.qvel)
-        self.pelvis, self.joints = qpos[:, :3], qpos[:, 7:]
-        self.velocity, self.spin, self.joint_velocity = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
-        self.orientation = _single(b.xmat[:, 1]).view(-1, 3, 3)
-        self.com = _single(b.subtree_com[:, 1])
-        self.com_velocity = _single(b.sensordata[:, self._com_velocity : self._com_velocity + 3])
-        self.ankle = _single(b.xpos[:, self._ankles])
-        self.ankle_rotation = _single(b.xmat[:, self._ankles]).view(-1, 2, 3, 3)
-        self.anchor, self.axis = _single(b.xanchor[:, 1:]), _single(b.xaxis[:, 1:])
+    def _field(self, name: str) -> Tensor:
+        return _single(getattr(self.batch, name))
+
+    def state(self, ids: Tensor) -> tuple[Tensor, Tensor]:
+        """States (k, 22) and (k, 21) of robots `ids`, float64."""
+        index = ids.numpy()
+        return torch.from_numpy(self.batch.qpos[index]), torch.from_numpy(self.batch.qvel[index])
 
     def step(self, target: Tensor, ids: Tensor | None = None) -> None:
         """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms); all, or only `ids`."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from romnav.robot.g1 import FOOT_LENGTH, SOLE, Humanoids
+from romnav.robot.g1 import FOOT_LENGTH, SOLE, Robots
 from romnav.robot.locomotion.legs import Legs, rotation
 from romnav.robot.locomotion.terrain import Heights
 from romnav.robot.spec import GaitSpec
@@ -157,7 +157,7 @@ class Walker:
         self.heading[ids] = heading
         self.joints[ids] = self.stance().expand(len(ids), 2, 6)
 
-    def soles(self, robots: Humanoids) -> Tensor:
+    def soles(self, robots: Robots) -> Tensor:
         """Centres (n, 2, 3) of the soles, left and right, world."""
         return robots.ankle + robots.ankle_rotation @ torch.tensor(SOLE)
 
@@ -180,7 +180,7 @@ class Walker:
         best = (tries.abs() + 8.0 * (bump - 0.015).clamp(min=0.0) + 20.0 * climb).argmin(1)
         return self._along(point, heading, tries[best][:, None])[:, 0]
 
-    def update(self, robots: Humanoids, command: Tensor, ground: Heights, *, first: Tensor | None = None) -> Reference:
+    def update(self, robots: Robots, command: Tensor, ground: Heights, *, first: Tensor | None = None) -> Reference:
         """The reference of this control step.
 
         Args:
@@ -263,7 +263,7 @@ class Walker:
         )  # fmt: skip
 
     def _inverse(
-        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, planted: Tensor,
+        self, robots: Robots, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, planted: Tensor,
         foot: Tensor, height: Tensor, pull: Tensor, landing: Tensor, ground: Heights, reach: Tensor,
     ) -> Tensor:  # fmt: skip
         """Leg joints: the swing foot placed from the pelvis as it is, the stance leg under the pelvis as wanted."""
@@ -302,7 +302,7 @@ class Walker:
         return self.joints
 
     def _weight(
-        self, robots: Humanoids, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, phase: Tensor
+        self, robots: Robots, rows: Tensor, stance: Tensor, swing: Tensor, sole: Tensor, phase: Tensor
     ) -> Tensor:
         """Joint torques (n, 2, 6) that hold the ground force of the pendulum on each foot, N m."""
         share = torch.empty(len(rows), 2)
