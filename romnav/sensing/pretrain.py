@@ -103,11 +103,11 @@ def loss_terms(
     labels: Tensor,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """Terms of the negative evidence lower bound per image, nat (`TERMS`; their sum is the loss).
+    """Terms of the loss per image, nat (`TERMS`): the negative evidence lower bound, but for the spec's weights.
 
     Squared errors of range and points where there is a return, cross-entropies of the validity everywhere and
-    of each class where there is a return; all of the clean image, given the corrupted one that was ``seen``
-    (both (B, rows, columns)). ``labels`` (B, rows, columns) are `Label`, -1 without a return.
+    of each class where there is a return, weighted by the true class; all of the clean image, given the corrupted
+    one that was ``seen`` (both (B, rows, columns)). ``labels`` (B, rows, columns) are `Label`, -1 without a return.
     """
     scale = spec.encoder.scale
     with torch.autocast(clean.device.type, torch.bfloat16, enabled=spec.encoder.bfloat16):
@@ -120,12 +120,13 @@ def loss_terms(
     points = model.encoder.directions.permute(2, 0, 1) * target[:, None]
     one_hot = functional.one_hot(labels.long().clamp(min=0), len(Label)).permute(0, 3, 1, 2).float()
     classes = functional.binary_cross_entropy_with_logits(out.classes.float(), one_hot, reduction="none")
+    weight = valid * clean.new_tensor(spec.class_weights)[labels.long().clamp(min=0)]
     xyz = (out.xyz - points[:, : out.xyz.shape[1]]).square().sum(1)
     return {
         "range": precision * (valid * (out.range - target).square()).sum() / count,
         "xyz": precision * (valid * xyz).sum() / count,
         "valid": functional.binary_cross_entropy_with_logits(out.valid.float(), valid, reduction="sum") / count,
-        "classes": (valid * classes.sum(1)).sum() / count,
+        "classes": (weight * classes.sum(1)).sum() / count,
         "divergence": spec.kl_weight * divergence(mean, log_variance).clamp(min=spec.free_bits).sum(),
     }
 

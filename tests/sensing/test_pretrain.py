@@ -59,8 +59,14 @@ def test_divergence_is_that_of_gaussians() -> None:
     torch.testing.assert_close(divergence(mean, log_variance), expected)
 
 
-def test_loss_is_the_evidence_bound_with_free_bits() -> None:
-    spec = SPEC.model_copy(update={"encoder": SPEC.encoder.model_copy(update={"bfloat16": False})})
+def test_loss_is_the_weighted_evidence_bound_with_free_bits() -> None:
+    spec = SPEC.model_copy(
+        update={
+            "encoder": SPEC.encoder.model_copy(update={"bfloat16": False}),
+            "class_weights": (1.0, 1.0, 3.0, 2.0),
+            "kl_weight": 0.25,
+        }
+    )
     directions = torch.nn.functional.normalize(torch.randn(6, 8, 3), dim=-1)
     model = Autoencoder(spec.encoder, directions)
     clean = torch.rand(4, 6, 8) * 5
@@ -83,10 +89,11 @@ def test_loss_is_the_evidence_bound_with_free_bits() -> None:
     torch.testing.assert_close(terms["valid"], -log_valid.sum() / 4)
     truth = torch.stack([labels == label for label in Label], 1).float()
     log_classes = torch.distributions.Bernoulli(logits=out.classes).log_prob(truth).sum(1)
-    torch.testing.assert_close(terms["classes"], -log_classes[valid].sum() / 4)
+    weighted = sum(w * log_classes[labels == label].sum() for label, w in zip(Label, (1.0, 1.0, 3.0, 2.0), strict=True))
+    torch.testing.assert_close(terms["classes"], -weighted / 4)
     nats = divergence(mean, log_variance)
     assert (nats < spec.free_bits).any()
-    torch.testing.assert_close(terms["divergence"], torch.where(nats > 0.5, nats, 0.5).sum())
+    torch.testing.assert_close(terms["divergence"], 0.25 * torch.where(nats > 0.5, nats, 0.5).sum())
 
 
 def test_poses_are_half_near_connectors_and_stand_on_the_surface(tiles: list[tuple[Tile, Grids]]) -> None:
