@@ -246,7 +246,7 @@ def tables(
     plan = _plan(ctx, scale)
     names = [name] if name else list(plan.project.experiments)
     reports = [stage for n in names for stage in plan.reports(n, plan.project.experiment(n).seeds)]
-    recorded = [r for r in reports if any((s.folder / s.outputs[0]).exists() for s in r.upstream)]
+    recorded = [r for r in reports if any((s.folder / s.outputs[-1]).exists() for s in r.upstream)]
     for stage in recorded or reports:
         _perform(plan, [stage], "cpu", True)
         _print_tables(stage)

@@ -231,13 +231,14 @@ class Stages:
         experiment = cast(Experiment, stage.settings)
         name = Path(stage.outputs[0]).stem
         arms, commits = {}, set()
+        records = {run.name: store.read(run) for run in stage.upstream}
+        finished = [run for run in stage.upstream if (record := records[run.name]) and record.outputs]
         for arm, label in experiment.labels.items():
-            runs = [run for run in stage.upstream if run.arm == arm and (run.folder / "policy.pt").exists()]
+            runs = [run for run in finished if run.arm == arm]
             if runs:
                 unfreeze_at = cast(Scale, runs[0].settings).navigation.encoder.unfreeze_at
                 arms[arm] = curves.read(label, unfreeze_at, [run.folder / "curve.csv" for run in runs])
-            records = [store.read(run) for run in runs]
-            commits |= {record.provenance["commit"][:12] for record in records if record and record.outputs}
+            commits |= {record.provenance["commit"][:12] for run in runs if (record := records[run.name])}
         if not arms:
             raise RomnavError(f"{stage.folder}: no arm of {name} is trained; run `romnav run ablation {name}`")
         provenance = {"scale": self.plan.scale.name, "commit": ", ".join(sorted(commits))}

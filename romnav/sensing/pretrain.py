@@ -208,6 +208,7 @@ class _Training:
         terms = self._terms()
         self._optimizer.zero_grad()
         terms.sum().backward()
+        torch.nn.utils.clip_grad_norm_(self._parameters, spec.max_grad_norm)
         self._optimizer.step()
         terms = terms.detach().double().cpu()
         self._recent += terms
