@@ -73,7 +73,7 @@ class Project:
         for name, experiment in self.experiments.items():
             lines.append(f"{name}: {experiment.title} ({experiment.kind})")
             labels = [*((arm, spec.label) for arm, spec in experiment.arms.items())]
-            labels += [(arm, "(scripted)") for arm in SCRIPTED]
+            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.tables]
             lines += [f"  {arm:<16} {label:<22} {self._evaluated(arm)}".rstrip() for arm, label in labels]
         return "\n".join(lines)
 
