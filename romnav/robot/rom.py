@@ -79,7 +79,12 @@ class ReducedOrderModel:
         xy = target[first, row]
         # no free candidate (a start in an occupied cell): argmax says 0, and the robot must stay
         stuck = (node < 0).all(dim=0)
-        xy = torch.where(stuck[:, None], here, xy)
+        self._place(torch.where(stuck[:, None], here, xy))
+        return (first > 0) | stuck
+
+    def _place(self, xy: Tensor) -> None:
+        """Stand on the surface at (E, 2), and on the other layer where the height crosses the threshold."""
+        world = self.world
         z = world.surface(self.tile, self.layer, xy)
         up = (z > world.switch[self.tile, self.layer + 1]).long()
         down = (z <= world.switch[self.tile, self.layer]).long()
@@ -87,4 +92,3 @@ class ReducedOrderModel:
         changed = world.node_at(self.tile, layer, xy) >= 0
         self.layer = torch.where(changed, layer, self.layer)
         self.position = torch.cat([xy, z[:, None]], dim=1)
-        return (first > 0) | stuck

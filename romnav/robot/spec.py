@@ -1,10 +1,21 @@
-"""Configuration of the humanoid: model, engine and locomotion."""
+"""Configuration of the robot: its body, and the humanoid's model, engine and locomotion."""
 
 from __future__ import annotations
 
 from pydantic import Field
 
 from romnav.config import Config
+
+
+class BodySpec(Config):
+    """The upright cylinder that holds a walking G1, for collisions with the exact solids."""
+
+    radius: float = 0.26
+    """Radius about the pelvis, m (A: the smallest around the model's meshes with its arms hanging is 0.260)."""
+    height: float = 1.33
+    """Height, m (A: the meshes reach 1.324 with straight legs)."""
+    step: float = 0.05
+    """What is no higher above the ground is stepped over, m (A: as in the occupancy grids)."""
 
 
 class RobotSpec(Config):

@@ -406,25 +406,45 @@ class SafetyFilter:
     """
 
     def __init__(self, robots: int, spec: SafetySpec | None = None, device: str = "cpu", workers: int = 1) -> None:
-        self.spec = spec = spec or SafetySpec()
+        self.spec = spec or SafetySpec()
+        self._device = device
+        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._prepare(robots)
+
+    def _prepare(self, robots: int) -> None:
         # A few robots at a time keep their grids in a core's cache; a GPU takes all at once.
-        share = min(robots, 4) if wp.get_device(device).is_cpu else robots
+        share = min(robots, 4) if wp.get_device(self._device).is_cpu else robots
         self._chunks = [slice(i, min(i + share, robots)) for i in range(0, robots, share)]
         self._stages = []
         for chunk in self._chunks:
             size = chunk.stop - chunk.start
-            rasterizer = Rasterizer(size, spec.occupancy, device)
-            solver = PoissonSolver(size, rasterizer.shape, spec.occupancy.cell, spec.poisson, device)
+            occupancy = self.spec.occupancy
+            rasterizer = Rasterizer(size, occupancy, self._device)
+            solver = PoissonSolver(size, rasterizer.shape, occupancy.cell, self.spec.poisson, self._device)
             self._stages.append((rasterizer, solver))
         self._robots = robots
-        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+
+    def select(self, robots: torch.Tensor) -> None:
+        """Keep only ``robots`` (indices), in that order, with their past."""
+        rasterizers, solvers = zip(*self._stages, strict=True)
+        self._prepare(len(robots))
+        for chunk, (rasterizer, solver) in zip(self._chunks, self._stages, strict=True):
+            rasterizer.carry(rasterizers, robots[chunk])
+            solver.carry(solvers, robots[chunk])
 
     def reset(self, robots: torch.Tensor | None = None) -> None:
         """Forget the past of ``robots`` (bool mask; all by default), as after a jump to another place."""
-        for chunk, (_, solver) in zip(self._chunks, self._stages, strict=True):
-            solver.reset(None if robots is None else robots[chunk])
+        for chunk, (rasterizer, solver) in zip(self._chunks, self._stages, strict=True):
+            for part in (rasterizer, solver):
+                part.reset(None if robots is None else robots[chunk])
 
-    def __call__(self, points: torch.Tensor, velocity: torch.Tensor, valid: torch.Tensor | None = None) -> Filtered:
+    def __call__(
+        self,
+        points: torch.Tensor,
+        velocity: torch.Tensor,
+        valid: torch.Tensor | None = None,
+        motion: torch.Tensor | None = None,
+    ) -> Filtered:
         """Filter one control period's commands.
 
         Args:
@@ -432,6 +452,8 @@ class SafetyFilter:
                 ground beneath the robot's centre.
             velocity: (B, 2) desired (vx, vy) in that frame, m/s. The yaw rate passes the filter by.
             valid: (B, N) bool, which returns to use; all by default.
+            motion: (B, 3) how the robots have moved (m) and turned (rad) since the last call, in their frame of then:
+                what has left the field of view is then remembered for a while, else forgotten.
         """
         if velocity.shape != (self._robots, 2):
             raise RomnavError(f"velocity has shape {tuple(velocity.shape)}; expected ({self._robots}, 2)")
@@ -444,7 +466,8 @@ class SafetyFilter:
         def work(index: int) -> Filtered:
             chunk = self._chunks[index]
             rasterizer, solver = self._stages[index]
-            grid = rasterizer(points[chunk], None if valid is None else valid[chunk])
+            seen = (None if x is None else x[chunk] for x in (valid, motion))
+            grid = rasterizer(points[chunk], *seen)
             h = solver.solve(grid.inflated)
             centre = torch.full((len(h), 2), rasterizer.centre, dtype=torch.float64, device=h.device)
             out = filter_velocity(h, self.spec.occupancy.cell, centre, velocity[chunk], self.spec.filter)

@@ -5,11 +5,15 @@ and landings no plane is the ground, so it is grown here from under the robot's 
 a neighbouring cell belongs to it if its lowest return is within a step, give or take a slope, of it. What is
 not ground in that sense (a table top, the storey below a railing) inherits the ground next to it; a return is
 an obstacle if it lies more than a step above the ground of its cell and lower than the robot's height.
+
+What has left the field of view is remembered for a while if the caller tells how the robot has moved: one return of
+each cell, carried along at its own place rather than its cell's, so that nothing is rounded twice.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -96,6 +100,46 @@ def _grow(
                 tail += 1
 
 
+# A remembered return: calls since it was seen, then its place in 2^-16 of the grid's side, so that of two in one
+# cell the least number is the youngest.
+_NOTHING = 2**62
+_SHARE = wp.constant(65536.0)
+
+
+@wp.func
+def _remember(x: float, y: float, age: wp.int64, half: float, cell: float, b: int, memory: wp.array3d(dtype=wp.int64)):
+    i = int(wp.floor((x + half) / cell))
+    j = int(wp.floor((y + half) / cell))
+    if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
+        return
+    u = wp.int64(wp.clamp((x + half) / (2.0 * half) * _SHARE, 0.0, _SHARE - 1.0))
+    v = wp.int64(wp.clamp((y + half) / (2.0 * half) * _SHARE, 0.0, _SHARE - 1.0))
+    wp.atomic_min(memory, b, i, j, (age << wp.int64(32)) | (u << wp.int64(16)) | v)
+
+
+@wp.kernel(enable_backward=False)
+def _recall(
+    before: wp.array3d(dtype=wp.int64),
+    motion: wp.array(dtype=wp.vec3),
+    half: float,
+    cell: float,
+    calls: wp.int64,
+    memory: wp.array3d(dtype=wp.int64),
+):
+    """Carry remembered returns into the frame of a robot that has moved, one call older."""
+    b, i, j = wp.tid()
+    packed = before[b, i, j]
+    age = (packed >> wp.int64(32)) + wp.int64(1)
+    if age >= calls or not wp.isfinite(motion[b]):
+        return
+    side = 2.0 * half
+    x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
+    y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
+    c = wp.cos(motion[b][2])
+    s = wp.sin(motion[b][2])
+    _remember(c * x + s * y, c * y - s * x, age, half, cell, b, memory)
+
+
 @wp.kernel(enable_backward=False)
 def _mark(
     points: wp.array2d(dtype=wp.vec3),
@@ -105,7 +149,7 @@ def _mark(
     cell: float,
     step: float,
     height: float,
-    occupied: wp.array3d(dtype=wp.bool),
+    memory: wp.array3d(dtype=wp.int64),
 ):
     b, k = wp.tid()
     p = points[b, k]
@@ -113,11 +157,11 @@ def _mark(
         return
     i = int(wp.floor((p[0] + half) / cell))
     j = int(wp.floor((p[1] + half) / cell))
-    if i < 0 or j < 0 or i >= occupied.shape[1] or j >= occupied.shape[2]:
+    if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
         return
     above = p[2] - ground[b, i // _GROUND_CELLS, j // _GROUND_CELLS]
     if above > step and above <= height:
-        occupied[b, i, j] = True
+        _remember(p[0], p[1], wp.int64(0), half, cell, b, memory)
 
 
 @wp.kernel(enable_backward=False)
@@ -200,7 +244,7 @@ class Occupancy:
     """Local occupancy: rows along x (ahead), columns along y (left), the robot in the middle."""
 
     occupied: torch.Tensor
-    """(B, n, n) bool, cells with a return off an obstacle."""
+    """(B, n, n) bool, cells with a return off an obstacle, now or remembered."""
     inflated: torch.Tensor
     """(B, n, n) bool, cells where the robot's centre must not be."""
     ground: torch.Tensor
@@ -240,15 +284,30 @@ class Rasterizer:
         self._lowest = torch.empty(robots, coarse, coarse, device=device)
         self._gap = torch.empty_like(self._lowest)
         self._queue = wp.empty((robots, coarse * coarse), dtype=int, device=device)
+        self._memory = torch.full((robots, *self.shape), _NOTHING, dtype=torch.int64, device=device)
 
-    def __call__(self, points: torch.Tensor, valid: torch.Tensor | None = None) -> Occupancy:
+    def reset(self, robots: torch.Tensor | None = None) -> None:
+        """Forget what ``robots`` have seen (a mask or indices; all of them by default)."""
+        self._memory[slice(None) if robots is None else robots] = _NOTHING
+
+    def carry(self, others: Sequence[Rasterizer], robots: torch.Tensor) -> None:
+        """Remember what ``robots`` (indices) among those of ``others``, counted through, have seen."""
+        self._memory = torch.cat([other._memory for other in others])[robots]
+
+    def __call__(
+        self, points: torch.Tensor, valid: torch.Tensor | None = None, motion: torch.Tensor | None = None
+    ) -> Occupancy:
         """Rasterise one cloud per robot.
 
         Args:
             points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the
                 ground beneath the robot's centre.
             valid: (B, N) bool, which returns to use (padding is invalid); all by default.
+            motion: (B, 3) how the robots have moved and turned since the last call, in their frame of then, m, m, rad.
+                Without it, or where it is not finite, what was seen before is forgotten.
         """
+        if motion is not None and motion.shape != (self._robots, 3):
+            raise RomnavError(f"motion has shape {tuple(motion.shape)}; expected ({self._robots}, 3)")
         if points.ndim != 3 or len(points) != self._robots or points.shape[2] != 3:
             raise RomnavError(f"points have shape {tuple(points.shape)}; expected ({self._robots}, N, 3)")
         spec, device = self.spec, self._device
@@ -260,7 +319,8 @@ class Rasterizer:
         mask = wp.from_torch(valid.contiguous())
         used, broken = torch.zeros(2, self._robots, dtype=torch.int32, device=device)
         ground = torch.empty_like(self._lowest)
-        occupied = torch.zeros(self._robots, *self.shape, dtype=torch.bool, device=device)
+        before, self._memory = self._memory, torch.full_like(self._memory, _NOTHING)
+        memory = wp.from_torch(self._memory)
         self._lowest.fill_(torch.inf)
         self._gap.fill_(-1.0)
         lowest, surface = wp.from_torch(self._lowest), wp.from_torch(ground)
@@ -279,12 +339,27 @@ class Rasterizer:
             outputs=[wp.from_torch(self._gap), surface],
             device=device,
         )
+        if motion is not None:
+            wp.launch(
+                _recall,
+                dim=before.shape,
+                inputs=[
+                    wp.from_torch(before),
+                    wp.from_torch(motion.float().contiguous(), dtype=wp.vec3),
+                    half,
+                    spec.cell,
+                    spec.memory,
+                ],
+                outputs=[memory],
+                device=device,
+            )
         wp.launch(
             _mark,
             dim=cloud.shape,
             inputs=[cloud, mask, surface, half, spec.cell, spec.step, spec.height],
-            outputs=[wp.from_torch(occupied)],
+            outputs=[memory],
             device=device,
         )
+        occupied = self._memory < _NOTHING
         inflated = inflate(occupied, self._reach / spec.cell)
         return Occupancy(occupied, inflated, ground, used, broken)

@@ -10,6 +10,8 @@ flux"), so near an obstacle ``h`` reads like a distance in metres. The barrier c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from romnav.errors import RomnavError
@@ -228,6 +230,18 @@ class PoissonSolver:
         """Forget the previous solution of ``robots`` (a mask or indices; all of them by default)."""
         self._fresh[slice(None) if robots is None else robots] = 1
         self._any_fresh = True
+
+    def carry(self, solvers: Sequence[PoissonSolver], robots: torch.Tensor) -> None:
+        """Start from the previous solutions of ``robots`` (indices) among those of ``solvers``, counted through."""
+        iterates = torch.cat([s._planes() for s in solvers], dim=1)
+        self._planes()[:] = iterates[:, robots]
+        self._fresh[:] = torch.cat([s._fresh for s in solvers])[robots]
+        self._any_fresh = bool(self._fresh.any())
+
+    def _planes(self) -> torch.Tensor:
+        """(2, robots, rows + 2, columns / 2 + 2) view of both colours of the iterate."""
+        robots, rows, _ = self.shape
+        return wp.to_torch(self._iterate)[:-1].view(2, robots, rows + 2, self._layout[0] + 2)
 
     def solve(self, occupied: torch.Tensor) -> torch.Tensor:
         """Safety function on the cells.

@@ -337,6 +337,26 @@ def test_workers_and_order_do_not_change_a_bit():
         assert torch.equal(a.velocity[turn], c.velocity)
 
 
+def test_selected_robots_keep_their_past():
+    rng = np.random.default_rng(2)
+    points = cloud(rng.uniform(-2, 2, (9, 6, 2)), np.zeros(9), np.zeros((9, 2)))
+    velocity = torch.from_numpy(rng.uniform(-1, 1, (9, 2))).float()
+    spec = SafetySpec(occupancy=OccupancySpec(size=3.0), poisson=PoissonSpec(sweeps=3, cold_sweeps=30))
+    whole, part = SafetyFilter(9, spec), SafetyFilter(9, spec)
+    keep = torch.tensor([7, 0, 3, 4, 8, 2])
+    motion = torch.from_numpy(rng.uniform(-0.1, 0.1, (9, 3))).float()
+    for safe in (whole, part):
+        safe(points, velocity)
+    part.select(keep)
+    for shift in (0.0, 0.3):
+        a = whole(points + shift, velocity, motion=motion)
+        b = part(points[keep] + shift, velocity[keep], motion=motion[keep])
+        assert torch.equal(a.h[keep], b.h)
+        assert torch.equal(a.velocity[keep], b.velocity)
+    part.reset()  # few sweeps: without its past, h is another
+    assert not torch.equal(part(points[keep] + shift, velocity[keep], motion=motion[keep]).h, b.h)
+
+
 def test_bad_input_stops_the_robot_that_has_it():
     rng = np.random.default_rng(1)
     points = cloud(rng.uniform(1.5, 2.5, (5, 3, 2)), np.zeros(5), np.zeros((5, 2)))

@@ -166,6 +166,52 @@ def test_inflation_is_the_exact_disc(shape, share, radius, seed):
             np.testing.assert_array_equal(out, exact)
 
 
+def test_what_was_seen_is_remembered_at_its_own_place():
+    rng = np.random.default_rng(3)
+    poles = rng.uniform(-2.0, 2.0, (7, 2))
+    spec = OccupancySpec(memory=12)
+    rasterizer = Rasterizer(2, spec)
+    floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
+    pose = np.zeros(3)
+    for call in range(16):
+        before = pose
+        if call:
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            pose = pose + np.array([0.07 * c, 0.07 * s, 0.13])
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        local = (poles - pose[:2]) @ np.array([[c, -s], [s, c]])
+        points = floor[None].repeat(2, 1, 1)
+        if call == 2:  # seen once, by the first robot alone
+            seen = torch.from_numpy(np.column_stack([local, np.full(7, 0.8)])).float()
+            points = torch.stack([torch.cat([floor, seen]), torch.cat([floor, floor[:7]])])
+        c, s = np.cos(before[2]), np.sin(before[2])
+        moved = np.array([[c, s], [-s, c]]) @ (pose - before)[:2]
+        motion = torch.tensor([*moved, pose[2] - before[2]]).float().expand(2, 3)
+        occupied = rasterizer(points, motion=motion).occupied
+        assert not occupied[1].any()
+        expected = np.zeros((120, 120), bool)
+        if 2 <= call < 14:
+            cells = np.floor((local + 3.0) / 0.05 + 1e-9).astype(int)
+            inside = ((cells >= 0) & (cells < 120)).all(axis=1)
+            expected[tuple(cells[inside].T)] = True
+        # a return within a tenth of a millimetre of a border may lie beyond it
+        assert (occupied[0].numpy() != expected).sum() <= 2
+        assert abs(int(occupied[0].sum()) - expected.sum()) <= 1
+
+
+def test_without_motion_nothing_is_remembered():
+    rasterizer = Rasterizer(3, OccupancySpec())
+    floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
+    pole = torch.cat([floor, torch.tensor([[1.0, 0.2, 0.8]])]).expand(3, -1, -1)
+    still = torch.zeros(3, 3)
+    still[1] = torch.nan
+    assert rasterizer(pole).occupied.flatten(1).any(dim=1).all()
+    rasterizer.reset(torch.tensor([False, False, True]))
+    occupied = rasterizer(floor.expand(3, -1, -1), motion=still).occupied
+    assert occupied.flatten(1).any(dim=1).tolist() == [True, False, False]
+    assert not rasterizer(floor.expand(3, -1, -1)).occupied.any()
+
+
 def test_mistakes_are_named():
     with pytest.raises(RomnavError, match="smaller than occupancy"):
         Rasterizer(1, OccupancySpec(radius=0.04))
