@@ -122,8 +122,7 @@ def ablation(
     from romnav.experiment.run import EVERYTHING
 
     plan = _plan(ctx, scale)
-    seeds = plan.project.experiment(name).seeds if seed is None else (seed,)
-    reports = plan.reports(name, seeds)
+    reports = _reports(plan, "ablation", name, seed)
     stages = _pending(reports, resume, EVERYTHING)
     if device == "cpu":
         _perform(plan, [stage for stage in stages if stage.kind == "encoder"], device, resume)
@@ -133,6 +132,32 @@ def ablation(
     _perform(plan, stages, device, resume)
     for report in reports:
         _print_tables(report)
+
+
+@run.command()
+def safety(
+    ctx: typer.Context,
+    name: Annotated[str, typer.Argument(help="A file under experiments/ of the kind safety.")] = "safety",
+    scale: ScaleOption = "smoke",
+    seed: SeedOption = None,
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Drive every arm through the three obstacle sets with the safety filter off and on; write table and figure."""
+    _run_trials(ctx, "safety", name, scale, seed, device, resume)
+
+
+@run.command()
+def deploy(
+    ctx: typer.Context,
+    name: Annotated[str, typer.Argument(help="A file under experiments/ of the kind deploy.")] = "deploy",
+    scale: ScaleOption = "smoke",
+    seed: SeedOption = None,
+    device: DeviceOption = "cpu",
+    resume: ResumeOption = True,
+) -> None:
+    """Drive every arm through the four long deployments with the safety filter off and on; write table and figure."""
+    _run_trials(ctx, "deploy", name, scale, seed, device, resume)
 
 
 @train.command()
@@ -242,7 +267,7 @@ def tables(
     name: Annotated[str | None, typer.Argument(help="Experiment; default: all.")] = None,
     scale: ScaleOption = "smoke",
 ) -> None:
-    """Write the tables and learning curves again from what is recorded; nothing is trained or evaluated."""
+    """Write tables and figures again from what is recorded; nothing is trained or evaluated."""
     plan = _plan(ctx, scale)
     names = [name] if name else list(plan.project.experiments)
     reports = [stage for n in names for stage in plan.reports(n, plan.project.experiment(n).seeds)]
@@ -344,6 +369,26 @@ def _plan(ctx: typer.Context, scale: str) -> Plan:
 
     project = Project.here(ctx.obj)
     return Plan(project, ScaleFile(project.root / "experiments" / "scales", scale))
+
+
+def _run_trials(
+    ctx: typer.Context, kind: str, name: str, scale: str, seed: int | None, device: str, resume: bool
+) -> None:
+    plan = _plan(ctx, scale)
+    (report,) = _reports(plan, kind, name, seed)
+    _execute(plan, [report], device, resume, {"trials", "report"})
+    _print_tables(report)
+
+
+def _reports(plan: Plan, kind: str, name: str, seed: int | None) -> list[Stage]:
+    """The reports of an experiment, which has to be of a kind; over all of its training seeds or one."""
+    experiment = plan.project.experiment(name)
+    if experiment.kind != kind:
+        raise RomnavError(
+            f"{plan.project.file(name)}: key kind is {experiment.kind}, not {kind}; "
+            f"run `romnav run {experiment.kind} {name}`"
+        )
+    return plan.reports(name, experiment.seeds if seed is None else (seed,))
 
 
 def _execute(plan: Plan, targets: list[Stage], device: str, resume: bool, kinds: Collection[str]) -> None:

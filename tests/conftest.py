@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
-from romnav.evaluation import rows
+from romnav.evaluation import rows, trial_rows
 
 
 def _episode_rows(
@@ -51,6 +51,64 @@ def _episode_rows(
         "machine": "2 cores",
     }
     return rows.make(columns, rows.Provenance(**{**made, **provenance}), source=f"{arm}/seed-{seed}")
+
+
+def _trial_run(
+    arm: str = "rom",
+    skill: float = 0.7,
+    seed: int = 0,
+    n: int = 32,
+    scenes: Sequence[str] = ("in-distribution", "out-of-distribution", "adversarial"),
+) -> trial_rows.TrialRows:
+    """Trials of an arm that arrives with probability `skill`; the filter halves that and prevents most collisions."""
+    luck = np.random.default_rng([seed, n, *arm.encode()])
+    parts = []
+    for filtered in (False, True):
+        for scene in scenes:
+            start, goal = luck.uniform(20, 40, (2, n, 2))
+            success = luck.random(n) < skill * (0.5 if filtered else 1.0)
+            steps = luck.integers(20, 60, n)
+            hits = [np.array([5], np.int16)[: int(luck.random() < (0.05 if filtered else 0.5))] for _ in range(n)]
+            ways = [np.linspace(a, b, k + 1) for a, b, k in zip(start, goal, steps, strict=True)]
+            tracks = [np.round(100 * np.column_stack([w, np.zeros(len(w))])).astype(np.int16).ravel() for w in ways]
+            distance = np.linalg.norm(goal - start, axis=1)
+            parts.append(
+                {
+                    "scene": np.full(n, scene, object),
+                    "filter": np.full(n, filtered),
+                    "trial": np.arange(n),
+                    **{f"spawn_{axis}": start[:, k] for k, axis in enumerate("xy")},
+                    **{f"goal_{axis}": goal[:, k] for k, axis in enumerate("xy")},
+                    **{name: np.zeros(n) for name in ("spawn_z", "spawn_yaw", "goal_z", "goal_yaw")},
+                    "geodesic": distance,
+                    "success_time": np.where(success, 0.2 * steps, np.nan),
+                    "outcome": np.where(success, "success", "timeout").astype(object),
+                    "time": 0.2 * steps,
+                    "path_length": distance,
+                    "final_distance": np.where(success, 0.4, distance),
+                    "collisions": np.array([len(h) for h in hits]),
+                    "contact_time": np.array([0.2 * len(h) for h in hits]),
+                    **{name: np.zeros(n) for name in ("brink_time", "acting_time", "held_time")},
+                    "blocked": ~success & filtered,
+                    "hits": _objects(hits),
+                    "track": _objects(tracks),
+                }
+            )
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    provenance = _episode_rows(arm, seed=seed, steps=0 if arm in ("oracle", "straight") else 1_500_000).provenance
+    return trial_rows.TrialRows(arm, seed, columns, provenance)
+
+
+def _objects(values: list) -> np.ndarray:
+    out = np.empty(len(values), object)
+    out[:] = values
+    return out
+
+
+@pytest.fixture(scope="session")
+def trial_run() -> Callable[..., trial_rows.TrialRows]:
+    """Factory of synthetic trials in scenes."""
+    return _trial_run
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from romnav.cli import app
-from romnav.evaluation import rows
+from romnav.evaluation import rows, trial_rows
 from romnav.experiment import launch, run, stages
 
 ROOT = Path(__file__).parents[1]
@@ -77,6 +77,7 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
         [],
         ["run"],
         ["run", "ablation"],
+        ["run", "safety"],
         ["train"],
         ["train", "locomotion"],
         ["train", "gaits"],
@@ -93,7 +94,12 @@ def test_every_command_explains_itself(words: list[str]) -> None:
 
 def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> None:
     lines = romnav("list").stdout.splitlines()
-    assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == ["pretrain", "spawn-goal"]
+    assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == [
+        "deploy",
+        "pretrain",
+        "safety",
+        "spawn-goal",
+    ]
     assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in lines]
     assert ["uniform-nocap", "UniformNoCap", "(RoM)"] in [line.split() for line in lines]
 
@@ -103,6 +109,7 @@ def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> N
     [
         (["run", "ablation", "spawn-gaol"], "unknown experiment spawn-gaol; did you mean spawn-goal?"),
         (["run", "ablation", "spawn-goal", "--scale", "smok"], "unknown scale smok; did you mean smoke?"),
+        (["run", "safety", "safty"], "unknown experiment safty; did you mean safety?"),
         (["train", "policy", "unifrom"], "unknown arm unifrom; did you mean uniform?"),
         (["train", "encoder", "--device", "cdua"], "device cdua: "),
         (["train", "encoder", "lidra"], "unknown sensor lidra; did you mean lidar?"),
@@ -156,6 +163,24 @@ def test_locomotion_is_trained_continued_and_recorded(project: Path) -> None:
     refused = romnav("train", "locomotion")
     assert refused.exit_code == 1
     assert "trained by another specification; use another directory or --no-resume" in refused.stderr
+
+
+def test_a_command_refuses_an_experiment_of_another_kind(project: Path) -> None:
+    file = project / "experiments" / "deploy.toml"
+    assert fails("run", "safety", "deploy") == f"{file}: key kind is deploy, not safety; run `romnav run deploy deploy`"
+    assert "run `romnav run safety safety`" in fails("run", "ablation", "safety")
+
+
+def test_trials_are_reported_from_their_rows(project: Path, trial_run: Callable[..., trial_rows.TrialRows]) -> None:
+    assert "no trials yet; run `romnav run safety`" in romnav("tables", "safety").stderr
+    folder = project / "results" / "smoke"
+    trial_rows.write(folder / "straight" / "seed-0" / "safety.parquet", trial_run("straight", n=12))
+    result = romnav("tables")
+    assert result.exit_code == 0, result.output
+    assert "Straight (sees nothing)" in result.stdout
+    for name in ("tables/safety.tex", "tables/safety.md", "tables/safety.csv", "figures/safety.png"):
+        assert (folder / name).stat().st_size > 500
+    assert not (folder / "tables" / "deploy.md").exists()
 
 
 def test_outside_of_a_project_there_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from romnav.navigation.observations import goal_observation
 from romnav.navigation.perception import LidarPerception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.spec import EnvSpec
+from romnav.robot.dynamics import Dynamics
 from romnav.robot.rom import ReducedOrderModel
 from romnav.threads import torch_threads
 from romnav.world.geodesic import GeodesicLookup
@@ -40,15 +41,17 @@ class Driver(Protocol):
 
 
 class View:
-    """What a driver may look at: the running episodes of a rollout, by row."""
+    """What a driver may look at: the running episodes of a rollout, by row. Robots are reduced-order by default."""
 
-    def __init__(self, world: World, episodes: EpisodeSet, env: EnvSpec) -> None:
+    def __init__(self, world: World, episodes: EpisodeSet, env: EnvSpec, robot: Dynamics | None = None) -> None:
         device = str(world.node.device)
         start = episodes.start(device)
         count = len(episodes)
         self.env = env
         self.episode = torch.arange(count, device=device)
-        self.robot = ReducedOrderModel(world, count, env.period)
+        self.noise = self.episode
+        """(A,) names the sensor noise of each row."""
+        self.robot = robot or ReducedOrderModel(world, count, env.period)
         self.robot.reset(self.episode, start)
         self.goal = start.goal
         self.goal_position = world.position[world.goal[start.goal]]
@@ -65,7 +68,7 @@ class View:
     def select(self, keep: Tensor) -> None:
         """Keep only the rows ``keep``."""
         self.robot.select(keep)
-        for name in ("episode", "goal", "goal_position", "goal_yaw", "previous"):
+        for name in ("episode", "noise", "goal", "goal_position", "goal_yaw", "previous"):
             setattr(self, name, getattr(self, name)[keep])
 
 
@@ -82,7 +85,7 @@ class Policy:
         """(A, 3) velocity command."""
         r = view.robot
         goal = goal_observation(r.position, r.yaw, view.goal_position, view.goal_yaw, view.env.max_goal_distance)
-        counters = torch.stack([view.episode, torch.full_like(view.episode, view.step)], dim=1)
+        counters = torch.stack([view.noise, torch.full_like(view.noise, view.step)], dim=1)
         obs = TensorDict(
             {
                 "lidar": self.perception(r.tile, r.position, r.yaw, counters),
@@ -123,7 +126,7 @@ class Straight:
         """Nothing to drop."""
 
 
-SCRIPTED = {"oracle": Oracle, "straight": Straight}
+SCRIPTED: dict[str, type[Oracle] | type[Straight]] = {"oracle": Oracle, "straight": Straight}
 
 
 @torch.inference_mode()

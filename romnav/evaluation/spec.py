@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from typing import Literal
+
+from pydantic import Field
+
 from romnav.config import Config
+from romnav.robot.spec import BodySpec
+from romnav.safety.spec import SafetySpec
+from romnav.sensing.spec import CorruptionSpec, LidarSpec
 from romnav.world.spec import SamplerSpec, WorldSpec
 
 
@@ -28,5 +36,30 @@ class EvaluationSpec(Config):
     """Longest episode, s (P); success within 45 s is read off the same episode."""
     reach: float = 0.5
     """Distance to the goal that is success, in 3D, m (P)."""
+    threads: int = 1
+    """PyTorch threads (A: another number gives other bits)."""
+
+
+class TrialSpec(Config):
+    """Trials of one arm in scenes, with the safety filter off and on."""
+
+    trials: int = Field(default=256, ge=1)
+    """Starts and goals in each scene, shared by all arms (A: an interval of a few percent)."""
+    duration: float = Field(default=60.0, gt=0.0)
+    """Longest trial, s (A: several times what the paper's trials took)."""
+    reach: float = 0.5
+    """Distance to the goal that is success, in 3D, m (P)."""
+    heading: float = Field(default=math.pi / 4, ge=0.0)
+    """Largest angle at the start between heading and shortest path, rad (A)."""
+    seed: int = 1000
+    """Seed of starts, goals and sensor noise."""
+    dynamics: Literal["body"] = "body"
+    """What is driven: the reduced-order model with a body that touches the exact solids."""
+    body: BodySpec = BodySpec()
+    filter: SafetySpec = SafetySpec()
+    sensor: LidarSpec = LidarSpec()
+    """What the filter sees, at the paper's resolution whatever the policy's; the mount is the robot's."""
+    corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
+    """What is done to the filter's range images (A: as to the policy's)."""
     threads: int = 1
     """PyTorch threads (A: another number gives other bits)."""

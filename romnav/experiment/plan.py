@@ -15,7 +15,10 @@ from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.experiment.project import Project
 from romnav.experiment.scales import Scale, ScaleFile
-from romnav.experiment.spec import SCRIPTED, suggest
+from romnav.experiment.spec import SCRIPTED, TrialKind, suggest
+
+SCENES = tuple(sorted((Path(__file__).parents[1] / "world" / "scenes").glob("[!_]*.py")))
+"""Descriptions of the scenes: trials in a scene that has been changed since are out of date."""
 
 PRETRAINING = {"lidar": "pretrain", "depth": "pretrain_depth"}
 """Section of a scale that tells how the encoder of a sensor is trained, by the section of the sensor."""
@@ -184,8 +187,16 @@ class Plan:
 
     def episodes(self, arm: str, seed: int) -> Stage:
         """The evaluated episodes of a trained or scripted arm."""
+        return self._driven("episodes", "episodes", "evaluation", (self.episode_set,), arm, seed)
+
+    def trials(self, kind: TrialKind, arm: str, seed: int) -> Stage:
+        """The trials of a trained or scripted arm in scenes, with the safety filter off and on."""
+        return self._driven("trials", kind, kind, SCENES, arm, seed)
+
+    def _driven(self, kind: str, output: str, section: str, reads: tuple[Path, ...], arm: str, seed: int) -> Stage:
+        """A stage that drives an arm and writes rows."""
         settings: Config = self.scale.settings
-        uses: tuple[str, ...] = ("evaluation",)
+        uses: tuple[str, ...] = (section,)
         upstream: tuple[Stage, ...] = ()
         if arm in SCRIPTED:
             seed = 0
@@ -196,14 +207,14 @@ class Plan:
             upstream = (*policy.upstream, policy)
         folder = self.folder / arm / f"seed-{seed}"
         return Stage(
-            kind="episodes",
-            name=f"episodes {arm}, seed {seed}",
+            kind=kind,
+            name=f"{output} {arm}, seed {seed}",
             folder=folder,
-            outputs=("episodes.parquet",),
-            record=folder / "episodes.json",
+            outputs=(f"{output}.parquet",),
+            record=folder / f"{output}.json",
             settings=settings,
             uses=uses,
-            reads=(self.episode_set,),
+            reads=reads,
             upstream=upstream,
             arm=arm,
             seed=seed,
@@ -216,6 +227,8 @@ class Plan:
             RomnavError: As `tables`.
         """
         experiment, seeds = self.project.experiment(name), tuple(seeds)
+        if experiment.kind != "ablation":
+            return [self.report(name, experiment.kind, seeds)]
         written = [self.tables(name, seeds)] if experiment.tables else []
         return [*written, *([self.curves(name, seeds)] if experiment.curves else [])]
 
@@ -256,6 +269,21 @@ class Plan:
             settings=experiment,
             uses=("tables",),
             upstream=tuple(self.episodes(arm, seed) for arm, seed in [*arms, *((arm, 0) for arm in SCRIPTED)]),
+        )
+
+    def report(self, name: str, kind: TrialKind, seeds: Iterable[int]) -> Stage:
+        """Table and figure of an experiment that consists of trials, its arms beside the scripted ones."""
+        experiment = self.project.experiment(name)
+        arms = [*((arm, seed) for arm in experiment.arms for seed in seeds), *((arm, 0) for arm in SCRIPTED)]
+        return Stage(
+            kind="report",
+            name=f"report {name}",
+            folder=self.folder,
+            outputs=(*(f"tables/{kind}.{format}" for format in ("tex", "md", "csv")), f"figures/{kind}.png"),
+            record=self.folder / "tables" / f"{name}.json",
+            settings=experiment,
+            uses=("labels",),
+            upstream=tuple(self.trials(kind, arm, seed) for arm, seed in arms),
         )
 
 

@@ -17,7 +17,10 @@ Action = Callable[[Stage, Progress], dict[str, Any]]
 """Makes the output of a stage and returns facts worth recording, e.g. its training steps."""
 
 
-EVERYTHING = ("encoder", "quality", "locomotion", "terrain", "gaits", "policy", "episodes", "tables", "curves")
+EVERYTHING = (
+    *("encoder", "quality", "locomotion", "terrain", "gaits", "policy"),
+    *("episodes", "trials", "tables", "curves", "report"),
+)
 """Kinds of stages."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from romnav.config import Config
 from romnav.errors import RomnavError
-from romnav.evaluation.spec import EvaluationSpec
+from romnav.evaluation.spec import EvaluationSpec, TrialSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
 from romnav.navigation.spec import NavigationSpec
 from romnav.robot.spec import LocomotionSpec
@@ -37,6 +37,10 @@ class Scale(Config):
     """The humanoid, and the policy that walks it."""
     evaluation: EvaluationSpec = EvaluationSpec()
     """Evaluation terrain and episodes."""
+    safety: TrialSpec = TrialSpec()
+    """Trials in the obstacle sets."""
+    deploy: TrialSpec = TrialSpec(trials=64, duration=240.0)
+    """Trials in the deployments (A: at half of the top speed, 100 m take 200 s)."""
 
 
 class ScaleFile:
@@ -64,8 +68,9 @@ class ScaleFile:
         data = self._data
         shared, own = experiment.scales.get(self.name, {}), experiment.arms[name].changes
         for key, change in ((f"scales.{self.name}", shared), (f"arms.{name}", own)):
-            if "evaluation" in change:
-                raise RomnavError(f"{file}: {key}.evaluation: set it in the scale, all arms share it")
+            for common in ("evaluation", "safety", "deploy"):
+                if common in change:
+                    raise RomnavError(f"{file}: {key}.{common}: set it in the scale, all arms share it")
             data = _merge(data, change)
             settings = parse(Scale, data, file, f"{key}.")
         return settings

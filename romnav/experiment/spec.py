@@ -34,10 +34,14 @@ class Arm(Config, extra="allow"):
         return self.model_extra or {}
 
 
-class Experiment(Config):
-    """Arms that are trained alike except for their changes, and evaluated on the same episodes."""
+TrialKind = Literal["safety", "deploy"]
+"""Experiments that drive arms through scenes, with the safety filter off and on."""
 
-    kind: Literal["ablation"]
+
+class Experiment(Config):
+    """Arms that are trained alike except for their changes, and evaluated on the same episodes or trials."""
+
+    kind: Literal["ablation", "safety", "deploy"]
     """What is done with the arms."""
     title: str
     """One line for lists."""

@@ -18,9 +18,12 @@ from romnav.experiment.spec import SCRIPTED, Experiment
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
+    from romnav.evaluation.rollout import Driver
+    from romnav.evaluation.rows import Provenance
     from romnav.navigation.perception import LidarPerception
     from romnav.sensing.depth import DepthCamera
     from romnav.sensing.lidar import Lidar
+    from romnav.world.scenes.scene import Scene
     from romnav.world.spec import WorldSpec
     from romnav.world.tile import Tile
     from romnav.world.world import World
@@ -42,6 +45,14 @@ def require_device(device: str) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise RomnavError(f"device {device}: {reason}; use cpu, cuda or cuda:N") from error
+
+
+def _scenes(kind: str) -> tuple[Scene, ...]:
+    """The scenes of an experiment that consists of trials."""
+    from romnav.world.scenes.deployments import deployment_scenes
+    from romnav.world.scenes.obstacles import obstacle_scenes
+
+    return {"safety": obstacle_scenes, "deploy": deployment_scenes}[kind]()
 
 
 @dataclass(frozen=True)
@@ -67,8 +78,10 @@ class Stages:
             "gaits": self.gaits,
             "policy": self.policy,
             "episodes": self.episodes,
+            "trials": self.trials,
             "tables": self.tables,
             "curves": self.curves,
+            "report": self.report,
         }
 
     def encoder(self, stage: Stage, progress: Progress) -> dict[str, Any]:
@@ -167,35 +180,13 @@ class Stages:
     def episodes(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Evaluates an arm on the paired episodes."""
         from romnav.evaluation import episodes, rollout, rows
-        from romnav.navigation import checkpoint
 
         settings = cast(Scale, stage.settings)
         paired = episodes.load(self.plan.episode_set)
         world = episodes.terrain(paired, self.plan.episode_set, self._worlds).to(self.device)
-        facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
-        policy = None
-        if stage.arm in SCRIPTED:
-            driver: Any = rollout.SCRIPTED[stage.arm]()
-        else:
-            trained = stage.upstream[-1]
-            perception = self._perception(trained, settings, world, EVALUATION_NOISE)
-            policy = trained.folder / "policy.pt"
-            actor = checkpoint.load_actor(policy, perception.encoder, self.device)
-            driver = rollout.Policy(actor, perception)
-            record = store.read(trained)
-            facts = record.facts if record else facts
+        driver = self._driver(stage, world)
         measured = rollout.evaluate(driver, world, paired, settings.navigation.env, settings.evaluation, progress)
-        source = store.provenance()
-        provenance = rows.Provenance(
-            scale=self.plan.scale.name,
-            commit=source["commit"],
-            spec_hash=stage.key[:16],
-            checkpoint_sha256=digest(policy) if policy else None,
-            episode_set=paired.digest,
-            version=__version__,
-            machine=source["machine"],
-            **facts,
-        )
+        provenance = self._provenance(stage, paired.digest)
         count = len(paired)
         columns: dict[str, Any] = {
             "arm": [stage.arm] * count,
@@ -208,6 +199,22 @@ class Stages:
             **measured,
         }
         rows.write(stage.folder / "episodes.parquet", rows.make(columns, provenance))
+        return {}
+
+    def trials(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Drives an arm through the scenes of an experiment, with the safety filter off and on."""
+        from romnav.evaluation import trial_rows, trials
+        from romnav.world.scenes.scene import scene_world
+
+        settings = cast(Scale, stage.settings)
+        kind = Path(stage.outputs[0]).stem
+        scenes = _scenes(kind)
+        world = scene_world(scenes).to(self.device)
+        spec = getattr(settings, kind)
+        columns = trials.run(self._driver(stage, world), scenes, world, settings.navigation.env, spec, progress)
+        starts = trials.draw(scenes, world, spec).digest
+        rows = trial_rows.TrialRows(str(stage.arm), stage.seed or 0, columns, self._provenance(stage, starts))
+        trial_rows.write(stage.folder / stage.outputs[0], rows)
         return {}
 
     def tables(self, stage: Stage, progress: Progress) -> dict[str, Any]:
@@ -245,6 +252,59 @@ class Stages:
         curves.draw(arms, stage.folder / stage.outputs[0])
         formats.write(curves.tabulate(name, experiment.title, arms, provenance), stage.folder / "tables")
         return {}
+
+    def report(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Writes the table and draws the figure of an experiment that consists of trials, of those that are there."""
+        from romnav.evaluation import trial_rows
+        from romnav.report import formats, trial_pictures, trial_tables
+
+        experiment = cast(Experiment, stage.settings)
+        files = [above.folder / above.outputs[0] for above in stage.upstream]
+        runs = [trial_rows.read(file) for file in files if file.exists()]
+        if not runs:
+            raise RomnavError(f"{files[0]}: no trials yet; run `romnav run {experiment.kind}`")
+        scenes = _scenes(experiment.kind)
+        build, draw = {
+            "safety": (trial_tables.safety, trial_pictures.draw_safety),
+            "deploy": (trial_tables.deploy, trial_pictures.draw_deployments),
+        }[experiment.kind]
+        formats.write(build(runs, scenes, experiment.labels), stage.folder / "tables")
+        draw(runs[0], scenes, stage.folder / stage.outputs[-1])
+        return {}
+
+    def _driver(self, stage: Stage, world: World) -> Driver:
+        """The policy or script of the arm of a stage."""
+        from romnav.evaluation import rollout
+        from romnav.navigation import checkpoint
+
+        if stage.arm in SCRIPTED:
+            return rollout.SCRIPTED[str(stage.arm)]()
+        trained = stage.upstream[-1]
+        perception = self._perception(trained, cast(Scale, stage.settings), world, EVALUATION_NOISE)
+        actor = checkpoint.load_actor(trained.folder / "policy.pt", perception.encoder, self.device)
+        return rollout.Policy(actor, perception)
+
+    def _provenance(self, stage: Stage, episode_set: str) -> Provenance:
+        """Where the rows of a stage come from."""
+        from romnav.evaluation.rows import Provenance
+
+        facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
+        policy = None
+        if stage.arm not in SCRIPTED:
+            policy = stage.upstream[-1].folder / "policy.pt"
+            record = store.read(stage.upstream[-1])
+            facts = record.facts if record else facts
+        source = store.provenance()
+        return Provenance(
+            scale=self.plan.scale.name,
+            commit=source["commit"],
+            spec_hash=stage.key[:16],
+            checkpoint_sha256=digest(policy) if policy else None,
+            episode_set=episode_set,
+            version=__version__,
+            machine=source["machine"],
+            **facts,
+        )
 
     def world(self, spec: WorldSpec, progress: Progress | None = None) -> World:
         """Terrain, from the cache if it was built before."""

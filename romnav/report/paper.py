@@ -67,5 +67,8 @@ SAFETY: dict[tuple[str, bool], dict[str, float]] = {
 }
 """Table e4-hardware: (obstacles, filter on) to trials out of ten, and time to goal in s."""
 
+DEPLOYMENTS = {"lab": 38.0, "stairwell": 51.0, "entrance": 51.0, "outdoors": 100.0}
+"""Lengths of the four deployments, m (Sec. IV-D and its figure); none of them included a collision."""
+
 TRAINING = {"environments": 4096, "rom_hours": 12.0, "rom_nav_hours": 32.0, "goal_mask_minutes": 14.0}
 """Cost of training on one H100 (Sec. III)."""

@@ -27,6 +27,8 @@ OCCUPIED = "#49566a"
 PATH = "#b2182b"
 PANE = 0.22
 """Opacity of walls and upper floors."""
+MARGIN = 10.0
+"""Around a rendered tile, pixels."""
 LIGHT = np.array([0.30, 0.45, 0.84])
 
 
@@ -85,11 +87,8 @@ def render(tile: Tile, azimuth: float, elevation: float, pixels: int = 1000) -> 
     colour = np.array([to_rgb(COLOURS[Label(k)]) for k in solids.label])
     colour[glass & (solids.label == Label.OBSTACLE)] = to_rgb(WALL)
     points, normals = _view(mesh, np.radians(azimuth), np.radians(elevation))
-    span = np.ptp(points[..., :2], axis=(0, 1))
-    scale = (pixels - 20) / span.max()
-    low = points[..., :2].min(axis=(0, 1))
-    points = np.concatenate([(points[..., :2] - low) * scale + 10.0, points[..., 2:] * scale], axis=2)
-    width, high = (int(n) for n in np.ceil(span * scale + 20))
+    low, scale, (width, high) = _frame(points, pixels)
+    points = np.concatenate([(points[..., :2] - low) * scale + MARGIN, points[..., 2:] * scale], axis=2)
     facing = normals @ _toward(np.radians(azimuth), np.radians(elevation)) > 1e-9
     shade = 0.62 + 0.38 * np.clip(normals @ LIGHT, 0.0, 1.0)
     paint = np.clip(colour[mesh.solid] * shade[:, None], 0.0, 1.0)
@@ -126,6 +125,25 @@ def render(tile: Tile, azimuth: float, elevation: float, pixels: int = 1000) -> 
     return image[::-1]
 
 
+def project(
+    tile: Tile, points: NDArray[np.float64], azimuth: float, elevation: float, pixels: int = 1000
+) -> NDArray[np.float64]:
+    """(P, 2) column and row, in the image that `render` makes of ``tile``, of ``points`` (P, 3), m."""
+    corners, _ = _view(triangulate(tile.solids, segments=20), np.radians(azimuth), np.radians(elevation))
+    low, scale, (_, high) = _frame(corners, pixels)
+    seen = points @ _basis(np.radians(azimuth), np.radians(elevation))
+    x, y = ((seen[:, :2] - low) * scale + MARGIN).T
+    return np.stack([x - 0.5, high - y - 0.5], axis=1)
+
+
+def _frame(points: NDArray[np.float64], pixels: int) -> tuple[NDArray[np.float64], float, tuple[int, int]]:
+    """Lower corner, pixels per metre, and width and height in pixels of what (T, 3, 3) corners cover."""
+    span = np.ptp(points[..., :2], axis=(0, 1))
+    scale = (pixels - 2 * MARGIN) / float(span.max())
+    width, high = (int(n) for n in np.ceil(span * scale + 2 * MARGIN))
+    return points[..., :2].min(axis=(0, 1)), scale, (width, high)
+
+
 def _see_through(solids: Solids) -> NDArray[np.bool_]:
     """(S,) walls and upper floors."""
     extent, tall = 2.0 * solids.half, solids.top - solids.bottom
@@ -143,13 +161,17 @@ def _toward(azimuth: float, elevation: float) -> NDArray[np.float64]:
 
 def _view(mesh: Mesh, azimuth: float, elevation: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Corners (T, 3, 3) as right, up and toward the viewer; outward unit normals (T, 3) in the tile frame."""
-    toward = _toward(azimuth, elevation)
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    basis = np.stack([right, np.cross(toward, right), toward], axis=1)
     corners = mesh.corners
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     norm = np.linalg.norm(normal, axis=1, keepdims=True)
-    return corners @ basis, normal / np.maximum(norm, 1e-12)
+    return corners @ _basis(azimuth, elevation), normal / np.maximum(norm, 1e-12)
+
+
+def _basis(azimuth: float, elevation: float) -> NDArray[np.float64]:
+    """Columns: right, up and toward the viewer."""
+    toward = _toward(azimuth, elevation)
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    return np.stack([right, np.cross(toward, right), toward], axis=1)
 
 
 def _fragments(

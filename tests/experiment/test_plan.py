@@ -65,6 +65,44 @@ def test_a_setting_reruns_exactly_what_depends_on_it(
     assert {name for name in before if before[name] != after[name]} == rerun
 
 
+@pytest.mark.parametrize(
+    ("section", "change", "rerun"),
+    [
+        ("safety.filter.occupancy", "margin = 0.2", {"safety rom", "safety oracle", "safety straight"}),
+        ("safety", "trials = 7", {"safety rom", "safety oracle", "safety straight"}),
+        ("navigation.ppo", "gamma = 0.9", {"policy rom", "safety rom"}),
+        ("deploy", "trials = 7", set()),
+        ("evaluation", "reach = 0.4", set()),
+    ],
+)
+def test_trials_are_repeated_where_filter_scenes_or_policy_changed(
+    tmp_path: Path, section: str, change: str, rerun: set[str]
+) -> None:
+    shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
+    before, after = (
+        everything(plan(tmp_path, SCALE + more).reports("safety", [0])[0]) for more in ("", f"[{section}]\n{change}\n")
+    )
+    changed = {name.removesuffix(", seed 0") for name in before if before[name] != after[name]}
+    assert changed == rerun | ({"report safety"} if rerun else set())
+
+
+def test_trials_are_out_of_date_when_a_scene_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
+    here = plan(tmp_path)
+    trials = here.trials("deploy", "oracle", 0)
+    assert {path.name for path in trials.reads} >= {"scene.py", "obstacles.py", "deployments.py"}
+    (tmp_path / "scene.py").write_text("another scene")
+    monkeypatch.setattr("romnav.experiment.plan.SCENES", (tmp_path / "scene.py",))
+    assert here.trials("deploy", "oracle", 0).key != trials.key
+
+
+def test_arms_share_the_settings_of_trials(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    here.project.file("more").write_text('kind = "safety"\ntitle = "t"\n[arms.own]\nlabel = "Own"\nsafety.trials = 3\n')
+    with pytest.raises(RomnavError, match=r"arms\.own\.safety: set it in the scale"):
+        here.trials("safety", "own", 0)
+
+
 def test_the_arms_share_one_encoder(tmp_path: Path) -> None:
     keys = everything(plan(tmp_path).tables("spawn-goal", [0]))
     assert len(keys) == 1 + 4 + 4 + 2 + 1

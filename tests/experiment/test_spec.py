@@ -67,7 +67,10 @@ def test_toml_arrays_and_integers_become_tuples_and_floats() -> None:
     [
         ("kind = ", "not valid TOML: Invalid value (at end of document)"),
         (EXPERIMENT.replace('title = "t"\n', ""), "key title is missing"),
-        (EXPERIMENT.replace("ablation", "ablatoin"), "key kind: input should be 'ablation', not 'ablatoin'"),
+        (
+            EXPERIMENT.replace("ablation", "ablatoin"),
+            "key kind: input should be 'ablation', 'safety' or 'deploy', not 'ablatoin'",
+        ),
         (EXPERIMENT.replace("arms.slow", "arms.oracle"), "arms: oracle cannot be the name of a trained arm"),
         (EXPERIMENT.replace('label = "RoM"', ""), "key arms.rom.label is missing"),
     ],

@@ -1,0 +1,318 @@
+"""Trials in scenes: the same starts and goals with the safety filter off and on, collisions on true geometry.
+
+What the paper does on hardware (Sec. IV-C, IV-D), with as many trials as an interval takes. Both halves run in one
+batch and meet the same sensor noise, so that a trial with the filter on is the one with it off until the filter acts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+from romnav import random
+from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.rollout import Driver, Progress, View
+from romnav.evaluation.spec import TrialSpec
+from romnav.navigation.observations import rotate
+from romnav.navigation.spec import EnvSpec
+from romnav.robot.body import BodyModel
+from romnav.safety.filter import Filtered, SafetyFilter, Status
+from romnav.sensing.corruption import Corruption
+from romnav.sensing.lidar import Lidar
+from romnav.threads import torch_threads
+from romnav.world.geodesic import UNIT, GeodesicLookup
+from romnav.world.scenes.scene import Scene
+from romnav.world.world import World
+
+APART = 1.0
+"""Contacts this long apart are two collisions, s."""
+HELD = 0.05, 0.2
+"""The filter holds the robot where it leaves less than the first of more than the second speed, m/s."""
+STUCK = 10.0, 0.5
+"""A robot is stuck that in so long a time, s, came no further than so far, m."""
+
+_NODE, _INSIDE_X, _INSIDE_Y, _GOAL, _HEADING, _GOAL_YAW = range(6)
+
+
+def draw(scenes: Sequence[Scene], world: World, spec: TrialSpec) -> EpisodeSet:
+    """``spec.trials`` starts and goals for every scene of ``world``, scene after scene.
+
+    A draw names the same place in scenes whose areas have the same free cells. Robots start heading along the shortest
+    path to their goal, give or take ``spec.heading``; the heading to arrive with is any.
+    """
+    trial = torch.arange(spec.trials)
+    parts = []
+    for index, (scene, grid) in enumerate(zip(scenes, world.grids, strict=True)):
+        nodes = [torch.from_numpy(np.flatnonzero(a.contains(grid.position))) for a in (scene.start, scene.goal)]
+        first = int(world.node_start[index])
+        goals = world.goal[world.goal_start[index] : world.goal_start[index + 1]] - first
+        back = (trial % 2).bool() if scene.both_ways else torch.zeros_like(trial, dtype=torch.bool)
+
+        def pick(from_: Tensor, draw: int) -> Tensor:
+            return from_[random.integers(len(from_), spec.seed, trial, draw)]
+
+        spawn = torch.where(back, pick(nodes[1], _NODE), pick(nodes[0], _NODE)) + first
+        ends = [torch.isin(goals, n).nonzero()[:, 0] for n in reversed(nodes)]
+        goal = pick(ends[0], _GOAL)
+        if scene.both_ways:
+            goal = torch.where(back, pick(ends[1], _GOAL), goal)
+        inside = torch.stack([random.uniform(spec.seed, trial, k) for k in (_INSIDE_X, _INSIDE_Y)], dim=1) - 0.5
+        xy = world.position[spawn, :2] + 0.98 * world.cell * inside
+        parts.append((torch.full_like(trial, index), spawn, xy, goal + world.goal_start[index]))
+    tile, spawn, xy, goal = (torch.cat(part) for part in zip(*parts, strict=True))
+    layer = world.layer[spawn]
+    _, along = GeodesicLookup(world)(tile, layer, xy, goal)
+    number = trial.repeat(len(scenes))
+    turn = (2.0 * random.uniform(spec.seed, number, _HEADING) - 1.0) * spec.heading
+    length = world.fields[world.field_start[goal] + spawn - world.node_start[tile]].to(torch.float64) * UNIT
+    start, end = world.position[spawn], world.position[world.goal[goal]]
+    columns = {
+        "tile": tile,
+        "layer": layer,
+        **{f"spawn_{axis}": column for axis, column in zip("xyz", (*xy.T, start[:, 2]), strict=True)},
+        "spawn_yaw": torch.atan2(along[:, 1], along[:, 0]) + turn,
+        "goal": goal,
+        **{f"goal_{axis}": column for axis, column in zip("xyz", end.T, strict=True)},
+        "goal_yaw": 2.0 * torch.pi * random.uniform(spec.seed, number, _GOAL_YAW),
+        "geodesic": length,
+    }
+    name = "+".join(scene.name for scene in scenes)
+    return EpisodeSet(name, world.spec, {key: value.numpy() for key, value in columns.items()})
+
+
+class TrialView(View):
+    """A view that leads back to the free cells where a body is off them, nearer to a solid than they allow."""
+
+    def __init__(self, world: World, episodes: EpisodeSet, env: EnvSpec, robot: BodyModel) -> None:
+        super().__init__(world, episodes, env, robot)
+        self._world = world
+        self._nearest = torch.from_numpy(_nearest_free(world.node.cpu().numpy() >= 0)).to(world.node.device)
+
+    def geodesic(self) -> tuple[Tensor, Tensor]:
+        """Distance (A,) to the goal and direction (A, 2) of the shortest path, by the nearest free cell."""
+        r, world = self.robot, self._world
+        xy = r.position[:, :2]
+        cell = world.index(xy)
+        off = world.node_at(r.tile, r.layer, xy) < 0
+        nearest = self._nearest[r.tile, r.layer, cell[:, 0], cell[:, 1]]
+        centre = (nearest + 0.5) * world.cell
+        at = torch.where(off[:, None], centre, xy)
+        distance, direction = self._lookup(r.tile, r.layer, at, self.goal)
+        back = at - xy
+        # on along the path and back to it at once: back alone would lead in circles around a corner
+        on = torch.nn.functional.normalize(direction + back / world.cell, dim=1)
+        return distance + torch.linalg.vector_norm(back, dim=1), torch.where(off[:, None], on, direction)
+
+
+def _nearest_free(free: NDArray[np.bool_]) -> NDArray[np.int16]:
+    """(T, L, N, N, 2) the free cell nearest to each cell within its layer; itself where the layer has none."""
+    out = np.empty((*free.shape, 2), np.int16)
+    for t, layer in np.ndindex(free.shape[:2]):
+        indices = ndimage.distance_transform_edt(~free[t, layer], return_distances=False, return_indices=True)
+        out[t, layer] = np.moveaxis(indices, 0, -1)
+    return out
+
+
+class Shield:
+    """The safety filter of ``robots`` robots, fed by a LiDAR of its own."""
+
+    def __init__(self, world: World, robots: int, spec: TrialSpec, env: EnvSpec) -> None:
+        device = str(world.node.device)
+        limits = {"forward": env.command.forward, "reverse": env.command.reverse, "lateral": env.command.lateral}
+        barrier = spec.filter.filter.model_copy(update={"period": env.period, **limits})
+        self._lidar = Lidar([tile.solids for tile in world.tiles], spec.sensor, device)
+        self._corruption = Corruption(spec.corruption, spec.seed, device)
+        self._filter = SafetyFilter(robots, spec.filter.model_copy(update={"filter": barrier}), device)
+        self._mount = torch.tensor([0.0, 0.0, spec.sensor.height], device=device)
+        self._pose = torch.full((robots, 3), torch.nan, device=device)
+
+    def __call__(
+        self, tile: Tensor, position: Tensor, yaw: Tensor, velocity: Tensor, noise: Tensor, step: int
+    ) -> Filtered:
+        """Filter velocities (B, 2) of robots that stand at ``position`` (B, 3), with sensor noise ``noise`` (B,)."""
+        ranges = self._lidar.scan(tile.to(torch.int32), position + self._mount, yaw)
+        ranges = self._corruption(ranges, noise, torch.full_like(noise, step))
+        points = ranges[..., None] * self._lidar.directions + self._mount
+        pose = torch.cat([position[:, :2], yaw[:, None]], dim=1)
+        moved = pose - self._pose
+        motion = torch.cat([rotate(moved[:, :2], self._pose[:, 2]), moved[:, 2:]], dim=1)
+        self._pose = pose
+        return self._filter(points.flatten(1, 2), velocity, (ranges > 0).flatten(1), motion)
+
+    def select(self, keep: Tensor) -> None:
+        """Keep only the robots ``keep`` (K,)."""
+        self._filter.select(keep)
+        self._pose = self._pose[keep]
+
+
+@dataclass
+class _Log:
+    """What is recorded of ``R`` trials over at most ``K`` steps, on the CPU."""
+
+    track: NDArray[np.int16]
+    """(K + 1, R, 3) positions, cm."""
+    contact: NDArray[np.bool_]
+    """(K, R) a solid is touched."""
+    brink: NDArray[np.bool_]
+    """(K, R) a drop-off stops the robot."""
+    acts: NDArray[np.bool_]
+    """(K, R) the filter changes the command."""
+    holds: NDArray[np.bool_]
+    """(K, R) the filter leaves next to nothing of it, see `HELD`."""
+
+    @classmethod
+    def of(cls, steps: int, trials: int) -> _Log:
+        flags = [np.zeros((steps, trials), bool) for _ in range(4)]
+        return cls(np.zeros((steps + 1, trials, 3), np.int16), *flags)
+
+
+@torch.inference_mode()
+def run(
+    driver: Driver,
+    scenes: Sequence[Scene],
+    world: World,
+    env: EnvSpec,
+    spec: TrialSpec,
+    progress: Progress | None = None,
+) -> dict[str, NDArray]:
+    """Drive every trial of ``scenes`` with the filter off and on; a trial ends at success or after ``spec.duration``.
+
+    The driver's memory of its previous command is its own, not the filtered one.
+
+    Returns:
+        One array (2 x scenes x trials,) per column of `romnav.evaluation.trial_rows` that a run measures.
+    """
+    with torch_threads(spec.threads):
+        episodes = draw(scenes, world, spec)
+        twice = replace(episodes, columns={k: np.tile(v, 2) for k, v in episodes.columns.items()})
+        count = len(twice)
+        filtered = np.arange(count) >= len(episodes)
+        names = np.array([scene.name for scene in scenes], object)
+        kept = [name for name in twice.columns if name.startswith(("spawn_", "goal_")) or name == "geodesic"]
+        measured, log = _drive(driver, world, twice, torch.from_numpy(filtered), env, spec, progress)
+        return {
+            "scene": names[twice.columns["tile"]],
+            "filter": filtered,
+            "trial": np.tile(np.arange(spec.trials), 2 * len(scenes)),
+            **{name: twice.columns[name].astype(np.float64) for name in kept},
+            **measured,
+            **_summarise(log, measured["time"], measured["outcome"], env.period),
+        }
+
+
+def _drive(
+    driver: Driver,
+    world: World,
+    episodes: EpisodeSet,
+    filtered: Tensor,
+    env: EnvSpec,
+    spec: TrialSpec,
+    progress: Progress | None,
+) -> tuple[dict[str, NDArray], _Log]:
+    count, limit = len(episodes), round(spec.duration / env.period)
+    device = world.node.device
+    robot = BodyModel(world, count, env.period, spec.body)
+    view = TrialView(world, episodes, env, robot)
+    view.noise = view.episode % (count // 2)
+    filtered = filtered.to(device)
+    guarded = filtered.nonzero()[:, 0]
+    shield = Shield(world, len(guarded), spec, env)
+    log = _Log.of(limit, count)
+    success_time = torch.full((count,), torch.nan, dtype=torch.float64, device=device)
+    time = torch.full((count,), spec.duration, dtype=torch.float64, device=device)
+    path = torch.zeros(count, dtype=torch.float64, device=device)
+    final = torch.zeros(count, dtype=torch.float64, device=device)
+    fell = torch.zeros(count, dtype=torch.bool, device=device)
+    running = torch.ones(count, dtype=torch.bool, device=device)
+    log.track[0] = _centimetres(robot.position)
+    for step in range(1, limit + 1):
+        command = driver.command(view)
+        executed = command.clone()
+        row = view.episode
+        alive = running[row]
+        if len(guarded):
+            wanted = command[guarded, :2]
+            pose = robot.tile[guarded], robot.position[guarded], robot.yaw[guarded]
+            safe = shield(*pose, wanted, view.noise[guarded], step)
+            executed[guarded, :2] = safe.velocity
+            at = row[guarded].cpu().numpy()
+            live = alive[guarded]
+            log.acts[step - 1, at] = ((safe.status != Status.UNCHANGED) & live).cpu().numpy()
+            left, asked = (torch.linalg.vector_norm(v, dim=1) for v in (safe.velocity, wanted))
+            log.holds[step - 1, at] = ((left < HELD[0]) & (asked > HELD[1]) & live).cpu().numpy()
+        before = robot.position[:, :2]
+        robot.step(executed)
+        view.previous = command
+        view.step = step
+        moved = torch.linalg.vector_norm(robot.position[:, :2] - before, dim=1).double()
+        path[row] += torch.where(alive, moved, 0.0)
+        at = row.cpu().numpy()
+        log.track[step, at] = _centimetres(robot.position)
+        log.contact[step - 1, at] = ((robot.contacts > 0) & alive).cpu().numpy()
+        log.brink[step - 1, at] = (robot.brink & alive).cpu().numpy()
+        distance = torch.linalg.vector_norm(view.goal_position - robot.position, dim=1)
+        reached = (distance < spec.reach) & alive & ~robot.fallen
+        over = alive & robot.fallen
+        success_time[row[reached]] = step * env.period
+        time[row[reached | over]] = step * env.period
+        fell[row[over]] = True
+        ended = reached | over | (alive & (step == limit))
+        if ended.any():
+            final[row[ended]] = view.geodesic()[0].double()[ended]
+            running[row[ended]] = False
+        left_over = int(running.sum())
+        if progress:
+            reached_share = float((~success_time.isnan()).double().mean())
+            progress(step, limit, f"reached {reached_share:.0%}, running {left_over}")
+        if left_over == 0:
+            break
+        if left_over < 0.85 * len(row):
+            keep = running[row].nonzero()[:, 0]
+            kept_guarded = running[row[guarded]].nonzero()[:, 0]
+            view.select(keep)
+            driver.select(keep)
+            if len(kept_guarded):
+                shield.select(kept_guarded)
+            guarded = filtered[view.episode].nonzero()[:, 0]
+    success = ~success_time.isnan().cpu().numpy()
+    outcome = np.where(success, "success", np.where(fell.cpu().numpy(), "fall", "timeout"))
+    measured = {"success_time": success_time, "time": time, "path_length": path, "final_distance": final}
+    return {"outcome": outcome, **{name: value.cpu().numpy() for name, value in measured.items()}}, log
+
+
+def _centimetres(position: Tensor) -> NDArray[np.int16]:
+    return (position * 100.0).round().to(torch.int16).cpu().numpy()
+
+
+def _summarise(log: _Log, time: NDArray, outcome: NDArray, period: float) -> dict[str, NDArray]:
+    """Columns of rows from what was recorded step by step."""
+    count = len(time)
+    steps = np.round(time / period).astype(int)
+    apart, window = round(APART / period), round(STUCK[0] / period)
+    hits = np.empty(count, object)
+    tracks = np.empty(count, object)
+    blocked = np.zeros(count, bool)
+    for k in range(count):
+        touching = np.flatnonzero(log.contact[:, k])
+        hits[k] = touching[np.diff(touching, prepend=-apart - 1) > apart].astype(np.int16) + 1
+        tracks[k] = log.track[: steps[k] + 1, k].ravel()
+        if outcome[k] == "timeout" and steps[k] > window:
+            came = log.track[steps[k], k].astype(float) - log.track[steps[k] - window, k]
+            held = log.holds[steps[k] - window : steps[k], k].mean()
+            blocked[k] = np.linalg.norm(came[:2]) < 100 * STUCK[1] and held >= 0.5
+    return {
+        "collisions": np.array([len(h) for h in hits]),
+        "contact_time": log.contact.sum(axis=0) * period,
+        "brink_time": log.brink.sum(axis=0) * period,
+        "acting_time": log.acts.sum(axis=0) * period,
+        "held_time": log.holds.sum(axis=0) * period,
+        "blocked": blocked,
+        "hits": hits,
+        "track": tracks,
+    }

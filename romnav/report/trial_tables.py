@@ -1,0 +1,178 @@
+"""Tables of trials in scenes: the safety filter off and on, the paper's rows beside ours."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from romnav.evaluation.trial_rows import TrialRows
+from romnav.evaluation.trial_statistics import Difference, Event, Summary, closed_routes, difference, summarise
+from romnav.report import paper
+from romnav.report.formats import Block, Cell, Row, Table, number
+from romnav.world.scenes.scene import Scene
+
+SHARED = 10
+"""Trials of the paper in each set (Sec. IV-C); of ours, the first."""
+ARMS = {False: "no CBF", True: "CBF"}
+SCRIPTED = {"oracle": "Oracle (knows the map)", "straight": "Straight (sees nothing)"}
+
+
+def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[str, str]) -> Table:
+    """Successes, collisions and time to goal in the obstacle sets; ``labels`` name the trained arms."""
+    blocks = []
+    for run in runs:
+        rows = []
+        for scene in scenes:
+            for filtered, arm in ARMS.items():
+                few, all_ = summarise(run, scene.name, filtered, SHARED), summarise(run, scene.name, filtered)
+                rows.append(Row(f"{scene.label}, {arm}", (*_counts(few), *_rates(all_))))
+            rows.append(Row(f"{scene.label}, CBF − no CBF", (*_dashes(3), *_differences(run, scene.name), *_dashes(1))))
+        blocks.append(Block("ours", _title(run, labels), tuple(rows)))
+    published = []
+    for scene in scenes:
+        for filtered, arm in ARMS.items():
+            p = paper.SAFETY[scene.name, filtered]
+            cells = (_of(p["successes"], SHARED), _of(p["collisions"], SHARED), _time(p["time"], p["time_std"], 1))
+            published.append(Row(f"{scene.label}, {arm}", (*cells, *_dashes(3))))
+    blocks.append(Block("paper", "Paper (hardware)", tuple(published)))
+    closed = "; ".join(
+        f"{_name(run, labels)} {sum(len(closed_routes(run, scene.name)) for scene in scenes)}" for run in runs
+    )
+    trials = len(runs[0].of(scenes[0].name, False)["trial"])
+    caption = (
+        "Poisson safety filter (CBF) off and on with three sets of obstacles. Starts and goals are shared by all rows. "
+        "Collision: trials in which the body, a cylinder of 0.26 m, touches a solid. Time to goal is mean ± standard "
+        f"deviation over successes. The first {SHARED} trials are shown as in the paper, and all {trials} in percent "
+        "with 95% Wilson intervals; differences are paired, with 95% bootstrap intervals († excludes zero). "
+        f"Trials that end with the filter holding a robot which arrives untouched without it: {closed}."
+    )
+    provenance, note = _provenance(runs, "trials")
+    return Table(
+        name="safety",
+        caption=f"{caption} {note}",
+        spans=((f"{SHARED} trials", 3), (f"{trials} trials", 3)),
+        header=(
+            "Obstacles, filter",
+            *("Success", "Collision", "Time (s)"),
+            *("Success (%)", "Collision (%)", "Time (s)"),
+        ),
+        columns=("success_10", "collision_10", "time_10", "success", "collision", "time"),
+        blocks=tuple(blocks),
+        provenance=provenance,
+    )
+
+
+def deploy(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[str, str]) -> Table:
+    """Successes, collisions, time and path in the deployments."""
+    blocks = []
+    for run in runs:
+        rows = []
+        for scene in scenes:
+            for filtered, arm in ARMS.items():
+                s = summarise(run, scene.name, filtered)
+                last = (
+                    number(s.path, 1, n=s.successes),
+                    _share(s.brinks, s.n),
+                    _share(s.blocked, s.n) if filtered else number(math.nan, 1),
+                )
+                rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last)))
+        blocks.append(Block("ours", _title(run, labels), tuple(rows)))
+    published = [
+        Row(scene.label, (_of(1, 1), _of(0, 1), number(math.nan, 1), number(length, 0), *_dashes(2)))
+        for scene, length in zip(scenes, paper.DEPLOYMENTS.values(), strict=True)
+    ]
+    blocks.append(Block("paper", "Paper (hardware, one trial each)", tuple(published)))
+    trials = len(runs[0].of(scenes[0].name, False)["trial"])
+    caption = (
+        f"The four long deployments, {trials} starts each, safety filter (CBF) off and on. Time to goal and path are "
+        "over successes; collision: trials in which the body, a cylinder of 0.26 m, touches a solid; brink: trials in "
+        "which a drop-off stopped the robot, which the model cannot fall from; blocked: trials that ended with the "
+        "filter holding the robot. 95% Wilson intervals."
+    )
+    provenance, note = _provenance(runs, "trials")
+    return Table(
+        name="deploy",
+        caption=f"{caption} {note}",
+        spans=(),
+        header=("Deployment", "Success (%)", "Collision (%)", "Time (s)", "Path (m)", "Brink (%)", "Blocked (%)"),
+        columns=("success", "collision", "time", "path", "brink", "blocked"),
+        blocks=tuple(blocks),
+        provenance=provenance,
+    )
+
+
+def _counts(s: Summary) -> tuple[Cell, ...]:
+    return _of(s.successes, s.n), _of(s.collided, s.n), _time(s.time, s.time_std, s.successes)
+
+
+def _rates(s: Summary) -> tuple[Cell, ...]:
+    return (
+        _share(s.successes, s.n, s.interval("success")),
+        _share(s.collided, s.n, s.interval("collision")),
+        _time(s.time, s.time_std, s.successes),
+    )
+
+
+def _differences(run: TrialRows, scene: str) -> tuple[Cell, ...]:
+    events: tuple[Event, ...] = ("success", "collision")
+    return tuple(_difference(difference(run, scene, event)) for event in events)
+
+
+def _difference(d: Difference) -> Cell:
+    cell = number(
+        d.diff, 1, sign=True, dagger=d.lo > 0 or d.hi < 0,
+        lo=d.lo, hi=d.hi, on_only=d.on_only, off_only=d.off_only, mid_p=d.mid_p,
+    )  # fmt: skip
+    return Cell(cell.value, f"{cell.text} [{d.lo:+.1f}, {d.hi:+.1f}]", cell.facts, dagger=cell.dagger)
+
+
+def _of(count: float, n: int) -> Cell:
+    return Cell(count, f"{count:.0f}/{n}", {"n": n})
+
+
+def _share(count: int, n: int, interval: tuple[float, float] | None = None) -> Cell:
+    percent = 100.0 * count / n
+    if interval is None:
+        return number(percent, 1, n=n)
+    lo, hi = (100.0 * x for x in interval)
+    return Cell(percent, f"{percent:.1f} [{lo:.1f}, {hi:.1f}]", {"lo": lo, "hi": hi, "n": n})
+
+
+def _time(mean: float, std: float, n: int) -> Cell:
+    if not math.isfinite(mean):
+        return number(math.nan, 1)
+    spread = f" ± {std:.1f}" if math.isfinite(std) else ""
+    return Cell(mean, f"{mean:.1f}{spread}", {"std": std, "n": n})
+
+
+def _dashes(count: int) -> tuple[Cell, ...]:
+    return (number(math.nan, 1),) * count
+
+
+def _name(run: TrialRows, labels: Mapping[str, str]) -> str:
+    return labels.get(run.arm, SCRIPTED.get(run.arm, run.arm))
+
+
+def _title(run: TrialRows, labels: Mapping[str, str]) -> str:
+    seed = "" if run.arm in SCRIPTED else f", training seed {run.seed}"
+    return f"This work, {run.provenance.scale} scale: {_name(run, labels)}{seed}"
+
+
+def _provenance(runs: Sequence[TrialRows], what: str) -> tuple[dict[str, str], str]:
+    """Provenance of the runs, and the end of the caption that states it."""
+
+    def distinct(texts: Sequence[str]) -> str:
+        return ", ".join(sorted(set(texts)))
+
+    facts = {
+        "scale": distinct([run.provenance.scale for run in runs]),
+        "commit": distinct([re.sub(r"(?<=^\w{12})\w+", "", run.provenance.commit) for run in runs]),
+        "episode_set": distinct([run.provenance.episode_set for run in runs]),
+    }
+    steps = distinct([f"{run.provenance.steps / 1e6:.3g} M" for run in runs if run.provenance.steps])
+    trained = f"training of {steps} steps; " if steps else ""
+    return (
+        facts,
+        f"This work: {facts['scale']} scale, {trained}{what} {facts['episode_set']}; commit {facts['commit']}.",
+    )

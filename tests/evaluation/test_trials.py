@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from romnav.evaluation import trials
+from romnav.evaluation.rollout import Oracle, Straight
+from romnav.evaluation.spec import TrialSpec
+from romnav.navigation.spec import EnvSpec
+from romnav.robot.body import BodyModel
+from romnav.safety.filter import Status
+from romnav.sensing.spec import LidarSpec
+from romnav.world.scenes.obstacles import obstacle_scenes
+from romnav.world.scenes.scene import Scene, scene_world
+from romnav.world.world import World
+
+SPEC = TrialSpec(trials=4, duration=25.0, sensor=LidarSpec(rows=30, columns=110))
+
+
+@pytest.fixture(scope="module")
+def scenes() -> tuple[Scene, ...]:
+    return obstacle_scenes()
+
+
+@pytest.fixture(scope="module")
+def world(scenes: tuple[Scene, ...]) -> World:
+    return scene_world(scenes)
+
+
+@pytest.fixture(scope="module")
+def straight(scenes: tuple[Scene, ...], world: World) -> dict:
+    return trials.run(Straight(), scenes, world, EnvSpec(), SPEC)
+
+
+@pytest.fixture(scope="module")
+def oracle(scenes: tuple[Scene, ...], world: World) -> dict:
+    return trials.run(Oracle(), scenes, world, EnvSpec(), SPEC)
+
+
+def test_starts_and_goals_are_shared_by_the_sets_and_lead_across_the_hall(scenes, world: World) -> None:
+    drawn = trials.draw(scenes, world, TrialSpec(trials=40)).columns
+    for name in ("spawn_x", "spawn_y", "goal_x", "goal_y", "goal_yaw"):
+        first, *others = np.split(drawn[name], 3)
+        assert all(np.allclose(first, other) for other in others)
+    assert (np.abs(drawn["goal_x"] - drawn["spawn_x"]) > 6.0).all()
+    rightward = (drawn["goal_x"] > drawn["spawn_x"])[:40]
+    assert np.array_equal(rightward, np.arange(40) % 2 == 0)
+    # more trials extend fewer
+    few = trials.draw(scenes, world, TrialSpec(trials=10)).columns
+    assert np.array_equal(few["spawn_x"][:10], drawn["spawn_x"][:10])
+    bearing = np.arctan2(drawn["goal_y"] - drawn["spawn_y"], drawn["goal_x"] - drawn["spawn_x"])
+    off = np.abs((drawn["spawn_yaw"] - bearing + np.pi) % (2 * np.pi) - np.pi)
+    assert (off < np.pi / 4 + 1.0).all()
+    assert np.ptp(off) > 0.3
+
+
+def test_the_shortest_paths_touch_nothing(oracle: dict) -> None:
+    off = ~oracle["filter"]
+    assert (oracle["outcome"][off] == "success").all()
+    assert (oracle["collisions"][off] == 0).all()
+    assert (oracle["path_length"][off] <= 1.1 * oracle["geodesic"][off]).all()
+
+
+def test_the_filter_keeps_a_blind_driver_off_what_it_can_see(straight: dict) -> None:
+    seen = np.isin(straight["scene"], ("in-distribution", "adversarial"))
+    hit = straight["collisions"] > 0
+    assert hit[seen & ~straight["filter"]].mean() > 0.6
+    assert hit[seen & straight["filter"]].mean() < 0.1
+    assert (straight["acting_time"][~straight["filter"]] == 0).all()
+    assert (straight["acting_time"][seen & straight["filter"]] > 0).all()
+
+
+def test_rows_are_consistent_with_their_tracks(straight: dict) -> None:
+    for k in range(len(straight["scene"])):
+        track = straight["track"][k].reshape(-1, 3) / 100.0
+        assert len(track) == round(straight["time"][k] / 0.2) + 1
+        assert np.allclose(track[0, :2], [straight["spawn_x"][k], straight["spawn_y"][k]], atol=0.006)
+        walked = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
+        assert walked == pytest.approx(straight["path_length"][k], abs=0.015 * len(track))
+        goal = np.array([straight[f"goal_{axis}"][k] for axis in "xyz"])
+        near = np.linalg.norm(track - goal, axis=1) < 0.5
+        assert near[:-1].sum() <= 1  # within rounding of the last one
+        assert (straight["outcome"][k] == "success") == np.isfinite(straight["success_time"][k])
+        hits = straight["hits"][k]
+        assert len(hits) == straight["collisions"][k]
+        assert (np.diff(hits) > 5).all()
+        assert (hits >= 1).all()
+        assert (hits < len(track)).all()
+
+
+def test_two_runs_are_the_same_and_a_trial_does_not_depend_on_the_others(scenes, world: World) -> None:
+    spec = SPEC.model_copy(update={"trials": 2, "duration": 6.0})
+    a, b = (trials.run(Straight(), scenes, world, EnvSpec(), spec) for _ in range(2))
+    more = trials.run(Straight(), scenes, world, EnvSpec(), spec.model_copy(update={"trials": 3}))
+    same = more["trial"] < 2
+    for name in ("path_length", "collisions", "acting_time"):
+        assert np.array_equal(a[name], b[name])
+    # noise is named by the row, and the filter's way with it; without the filter there is none
+    off = ~a["filter"]
+    assert np.array_equal(a["path_length"][off], more["path_length"][same][off])
+
+
+def test_off_the_free_cells_the_oracle_finds_back(scenes, world: World) -> None:
+    spec = TrialSpec(trials=1)
+    robot = BodyModel(world, 3, 0.2)
+    view = trials.TrialView(world, trials.draw(scenes, world, spec), EnvSpec(), robot)
+    robot.position[:, :2] = torch.tensor([1.06, 5.0])  # the wall's inner face is at 0.8 m
+    assert (world.node_at(robot.tile, robot.layer, robot.position[:, :2]) < 0).all()
+    distance, direction = view.geodesic()
+    assert torch.isfinite(distance).all()
+    assert (direction[:, 0] > 0.3).all()
+    assert torch.allclose(torch.linalg.vector_norm(direction, dim=1), torch.ones(3))
+
+
+def test_blocked_is_held_and_stuck_at_the_end() -> None:
+    log = trials._Log.of(100, 3)
+    log.track[:, 0, 0] = 7  # stands still, held
+    log.holds[:, 0] = True
+    log.track[:, 1, 0] = 7  # stands still by itself
+    log.track[:, 2, 0] = np.arange(101) * 10  # held now and then, but walks on
+    log.holds[::2, 2] = True
+    log.contact[[3, 4, 5, 20, 30], 1] = True
+    columns = trials._summarise(log, np.full(3, 20.0), np.array(["timeout"] * 3), 0.2)
+    assert columns["blocked"].tolist() == [True, False, False]
+    assert columns["hits"][1].tolist() == [4, 21, 31]
+    assert columns["contact_time"].tolist() == pytest.approx([0.0, 1.0, 0.0])
+
+
+def test_the_shield_sees_a_tube_and_stops_before_it(world: World) -> None:
+    shield = trials.Shield(world, 1, TrialSpec(), EnvSpec())
+    tile = torch.tensor([2])
+    # 0.9 m before the vertical tube at (4.4, 5.5), and with the back to it
+    position = torch.tensor([[3.5, 5.5, 0.0]])
+    wanted, noise = torch.tensor([[1.0, 0.0]]), torch.tensor([0])
+    safe = shield(tile, position, torch.zeros(1), wanted, noise, 1)
+    assert safe.status[0] == Status.FILTERED
+    assert safe.velocity[0, 0] < 0.6

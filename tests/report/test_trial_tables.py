@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import csv
+import io
+import re
+
+import pytest
+
+from romnav.evaluation.trial_statistics import closed_routes, summarise
+from romnav.report import formats, trial_tables
+from romnav.world.scenes.deployments import deployment_scenes
+from romnav.world.scenes.obstacles import obstacle_scenes
+
+LABELS = {"rom": "RoM"}
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return obstacle_scenes()
+
+
+def test_safety_shows_ten_trials_as_the_paper_and_all_with_intervals(trial_run, scenes) -> None:
+    runs = [trial_run("rom", n=64), trial_run("oracle", n=64, skill=1.0)]
+    table = trial_tables.safety(runs, scenes, LABELS)
+    rom, oracle, published = table.blocks
+    assert [len(block.rows) for block in table.blocks] == [9, 9, 6]
+    row = rom.rows[1]
+    few, every = (summarise(runs[0], "in-distribution", True, first) for first in (10, None))
+    assert row.label == "In-Distribution, CBF"
+    assert [cell.text for cell in row.cells[:2]] == [f"{few.successes}/10", f"{few.collided}/10"]
+    assert row.cells[2].text == f"{few.time:.1f} ± {few.time_std:.1f}"
+    lo, hi = every.interval("success")
+    assert row.cells[3].text == f"{100 * every.successes / 64:.1f} [{100 * lo:.1f}, {100 * hi:.1f}]"
+    assert "Oracle" in oracle.title
+    assert "RoM, training seed 0" in rom.title
+    assert [cell.text for cell in published.rows[3].cells[:3]] == ["10/10", "0/10", "11.0 ± 5.8"]
+    assert [cell.text for cell in published.rows[4].cells[:3]] == ["10/10", "4/10", "5.5 ± 1.0"]
+    closed = sum(len(closed_routes(runs[0], scene.name)) for scene in scenes)
+    assert f"RoM {closed};" in table.caption
+
+
+def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run) -> None:
+    scenes = deployment_scenes()
+    run = trial_run("rom", n=16, scenes=[scene.name for scene in scenes])
+    table = trial_tables.deploy([run], scenes, LABELS)
+    ours, published = table.blocks
+    assert [row.label for row in ours.rows[:2]] == ["Cluttered lab, no CBF", "Cluttered lab, CBF"]
+    assert [row.cells[3].text for row in published.rows] == ["38", "51", "51", "100"]
+    assert ours.rows[0].cells[5].text == "–"  # blocked by a filter that is off: there is no such thing
+    assert ours.rows[1].cells[5].text != "–"
+
+
+def test_all_formats_hold_the_numbers(trial_run, scenes) -> None:
+    table = trial_tables.safety([trial_run("rom", n=64)], scenes, LABELS)
+    text = formats.latex(table)
+    assert r"$\pm$" in text
+    assert "±" not in text
+    assert all(line.count("&") == 6 for line in text.splitlines() if re.match(r"(In|Out|Adv).*\\\\$", line))
+    rows = list(csv.DictReader(io.StringIO(formats.to_csv(table))))
+    paired = [r for r in rows if "−" in r["row"] and r["column"] == "collision"]
+    assert len(paired) == 3
+    assert all(float(r["lo"]) <= float(r["value"]) <= float(r["hi"]) and r["mid_p"] for r in paired)
+    assert "CBF − no CBF" in formats.markdown(table)
