@@ -33,7 +33,7 @@ from romnav.safety.spec import FilterSpec, SafetySpec
 
 CELLS = 120
 CELL = 0.05
-REACH = 0.407
+REACH = 0.367
 """Radius and margin, m."""
 CLOSE = (0.01, 0.03)
 """Largest difference that agrees, of h (share of its maximum) and of the filtered velocity, m/s."""

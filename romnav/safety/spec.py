@@ -14,8 +14,8 @@ class OccupancySpec(Config):
     """Side of a cell, m (P)."""
     size: float = Field(6.0, gt=0)
     """Side of the square grid around the robot, m (A: three seconds of travel either way)."""
-    radius: float = Field(0.3, gt=0)
-    """Radius of the disc that holds the robot, m (A: the G1's shoulders are 0.45 m apart)."""
+    radius: float = Field(0.26, gt=0)
+    """Radius of the disc that holds the robot, m (A: the G1's meshes with its arms hanging; `robot.spec.BodySpec`)."""
     margin: float = Field(0.107, ge=0)
     """Added to the radius, m (A: 1.5 sqrt(2) cells, the least for which h > 0 proves that the disc is clear
     of every point, whatever the rounding to cells; 0 is the paper's plain convolution)."""
