@@ -127,11 +127,11 @@ class Attention(nn.Module):
         width = spec.attention
         self.heads = spec.heads
         self.embed = nn.Linear(channels, width)
-        self.place = nn.Parameter(0.02 * torch.randn(tokens, width))
+        self.place = nn.Parameter(torch.randn(tokens, width))
         self.self_qkv = nn.Linear(width, 3 * width)
         self.self_out = nn.Linear(width, width)
         self.norm = nn.LayerNorm(width)
-        self.queries = nn.Parameter(torch.randn(spec.queries, width) * width**-0.5)
+        self.queries = nn.Parameter(torch.randn(spec.queries, width))
         self.state_query = nn.Linear(state, width)
         self.cross_kv = nn.Linear(width, 2 * width)
         self.cross_out = nn.Linear(width, width)
