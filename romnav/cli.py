@@ -84,6 +84,9 @@ app.add_typer(run, name="run")
 app.add_typer(train, name="train")
 app.add_typer(play, name="play")
 
+ArmOption = Annotated[
+    list[str] | None, typer.Option("--arm", help="Only this arm, trained or scripted; may be repeated.")
+]
 ScaleOption = Annotated[
     str, typer.Option("--scale", help="smoke (minutes), cpu (hours) or paper (the paper's numbers, GPU).")
 ]
@@ -138,26 +141,28 @@ def ablation(
 def safety(
     ctx: typer.Context,
     name: Annotated[str, typer.Argument(help="A file under experiments/ of the kind safety.")] = "safety",
+    arm: ArmOption = None,
     scale: ScaleOption = "smoke",
     seed: SeedOption = None,
     device: DeviceOption = "cpu",
     resume: ResumeOption = True,
 ) -> None:
     """Drive every arm through the three obstacle sets with the safety filter off and on; write table and figure."""
-    _run_trials(ctx, "safety", name, scale, seed, device, resume)
+    _run_trials(ctx, "safety", name, arm, scale, seed, device, resume)
 
 
 @run.command()
 def deploy(
     ctx: typer.Context,
     name: Annotated[str, typer.Argument(help="A file under experiments/ of the kind deploy.")] = "deploy",
+    arm: ArmOption = None,
     scale: ScaleOption = "smoke",
     seed: SeedOption = None,
     device: DeviceOption = "cpu",
     resume: ResumeOption = True,
 ) -> None:
     """Drive every arm through the four long deployments with the safety filter off and on; write table and figure."""
-    _run_trials(ctx, "deploy", name, scale, seed, device, resume)
+    _run_trials(ctx, "deploy", name, arm, scale, seed, device, resume)
 
 
 @train.command()
@@ -372,11 +377,26 @@ def _plan(ctx: typer.Context, scale: str) -> Plan:
 
 
 def _run_trials(
-    ctx: typer.Context, kind: str, name: str, scale: str, seed: int | None, device: str, resume: bool
+    ctx: typer.Context,
+    kind: str,
+    name: str,
+    arms: list[str] | None,
+    scale: str,
+    seed: int | None,
+    device: str,
+    resume: bool,
 ) -> None:
+    from romnav.experiment.spec import suggest
+
     plan = _plan(ctx, scale)
     (report,) = _reports(plan, kind, name, seed)
-    _execute(plan, [report], device, resume, {"trials", "report"})
+    known = {str(stage.arm) for stage in report.upstream}
+    for arm in arms or ():
+        if arm not in known:
+            raise RomnavError(f"{plan.project.file(name)}: no arm {arm}{suggest(arm, known)}")
+    wanted = [stage for stage in report.upstream if not arms or stage.arm in arms]
+    _execute(plan, wanted, device, resume, {"trials"})
+    _perform(plan, [report], device, resume)
     _print_tables(report)
 
 

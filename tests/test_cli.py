@@ -169,6 +169,7 @@ def test_a_command_refuses_an_experiment_of_another_kind(project: Path) -> None:
     file = project / "experiments" / "deploy.toml"
     assert fails("run", "safety", "deploy") == f"{file}: key kind is deploy, not safety; run `romnav run deploy deploy`"
     assert "run `romnav run safety safety`" in fails("run", "ablation", "safety")
+    assert fails("run", "safety", "--arm", "oracel").endswith("safety.toml: no arm oracel; did you mean oracle?")
 
 
 def test_trials_are_reported_from_their_rows(project: Path, trial_run: Callable[..., trial_rows.TrialRows]) -> None:
