@@ -15,7 +15,7 @@ $(VENV)/stamp: pyproject.toml
 	@touch $@
 
 demo: setup
-	$(BIN)/romnav run ablation spawn-goal --scale smoke
+	$(BIN)/romnav --results .cache/demo run ablation spawn-goal --scale smoke
 
 test: setup
 	$(BIN)/pytest
