@@ -63,3 +63,12 @@ class TrialSpec(Config):
     """What is done to the filter's range images (A: as to the policy's)."""
     threads: int = 1
     """PyTorch threads (A: another number gives other bits)."""
+
+
+class DeploymentSpec(TrialSpec):
+    """Trials in the deployments."""
+
+    trials: int = Field(default=64, ge=1)
+    """Starts in each deployment, shared by all arms (A)."""
+    duration: float = Field(default=240.0, gt=0.0)
+    """Longest trial, s (A: at half of the top speed, 100 m take 200 s)."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from romnav.config import Config
 from romnav.errors import RomnavError
-from romnav.evaluation.spec import EvaluationSpec, TrialSpec
+from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
 from romnav.navigation.spec import NavigationSpec
 from romnav.robot.spec import LocomotionSpec
@@ -39,8 +39,8 @@ class Scale(Config):
     """Evaluation terrain and episodes."""
     safety: TrialSpec = TrialSpec()
     """Trials in the obstacle sets."""
-    deploy: TrialSpec = TrialSpec(trials=64, duration=240.0)
-    """Trials in the deployments (A: at half of the top speed, 100 m take 200 s)."""
+    deploy: DeploymentSpec = DeploymentSpec()
+    """Trials in the deployments."""
 
 
 class ScaleFile:
