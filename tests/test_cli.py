@@ -373,6 +373,8 @@ def test_errors_and_control_c_of_a_real_process(project: Path) -> None:
     (project / "benchmarks" / "long.py").write_text("import time\nprint('on', flush=True)\ntime.sleep(60)\n")
     process = subprocess.Popen(
         [sys.executable, ROOT / "cli.py", "bench", "long"],
+        # a runner in the background ignores Ctrl-C, and its children would inherit that
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
