@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import numpy as np
@@ -141,8 +141,7 @@ def evaluate(
     """Drive all ``episodes`` once; an episode ends at success, at a fall or after ``spec.duration``.
 
     Returns:
-        One array (n,) per column of the episode rows that a rollout measures: success_time, outcome, time,
-        path_length (planar, sampled once per period), final_distance (geodesic), collisions.
+        One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
     """
     with torch_threads(spec.threads):
         return _evaluate(driver, world, episodes, env, spec, progress)
@@ -152,59 +151,92 @@ def _evaluate(
     driver: Driver, world: World, episodes: EpisodeSet, env: EnvSpec, spec: EvaluationSpec, progress: Progress | None
 ) -> dict[str, NDArray]:
     view = View(world, episodes, env)
-    count = len(episodes)
-    device = view.goal.device
-    limit = round(spec.duration / env.period)
-    success_time = torch.full((count,), torch.nan, dtype=torch.float64, device=device)
-    time = torch.full((count,), spec.duration, dtype=torch.float64, device=device)
-    path = torch.zeros(count, dtype=torch.float64, device=device)
-    final = torch.zeros(count, dtype=torch.float64, device=device)
-    collisions = torch.zeros(count, dtype=torch.int64, device=device)
-    fell = torch.zeros(count, dtype=torch.bool, device=device)
-    running = torch.ones(count, dtype=torch.bool, device=device)
-    successes = 0
-    for step in range(1, limit + 1):
+    outcomes = Outcomes(view, spec.duration, spec.reach)
+    collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
+    for step in outcomes.steps(progress):
         robot = view.robot
         command = driver.command(view)
         before = robot.position[:, :2]
         robot.step(command)
         view.previous = command
         view.step = step
-        row = view.episode
-        alive = running[row]
-        moved = torch.linalg.vector_norm(robot.position[:, :2] - before, dim=1).double()
-        path[row] += torch.where(alive, moved, 0.0)
-        collisions[row] += ((robot.contacts > 0) & alive).long()
-        distance = torch.linalg.vector_norm(view.goal_position - robot.position, dim=1)
-        reached = (distance < spec.reach) & alive & ~robot.fallen
-        over = alive & robot.fallen
-        success_time[row[reached]] = step * env.period
-        time[row[reached | over]] = step * env.period
-        fell[row[over]] = True
-        ended = reached | over | (alive & (step == limit))
-        if ended.any():
-            final[row[ended]] = view.geodesic()[0].double()[ended]
-            running[row[ended]] = False
-        left = int(running.sum())
-        successes = int((~success_time.isnan()).sum())
-        if progress:
-            progress(step, limit, f"reached {successes / count:.0%}, running {left}")
-        if left == 0:
-            break
+        collisions[view.episode] += ((robot.contacts > 0) & outcomes.alive()).long()
+        outcomes.add(before)
         # dropping rows costs copies: do it once a quarter of the batch is idle
-        if left < 0.75 * len(row):
-            keep = running[row].nonzero()[:, 0]
+        if 0 < outcomes.left < 0.75 * len(view.episode):
+            keep = outcomes.alive().nonzero()[:, 0]
             view.select(keep)
             driver.select(keep)
-    if progress:
-        progress(limit, limit, f"reached {successes / count:.0%}")
-    success = ~success_time.isnan().cpu().numpy()
-    outcome = np.where(success, "success", np.where(fell.cpu().numpy(), "fall", "timeout"))
-    measured = {
-        "success_time": success_time,
-        "time": time,
-        "path_length": path,
-        "final_distance": final,
-        "collisions": collisions,
-    }
-    return {"outcome": outcome, **{name: value.cpu().numpy() for name, value in measured.items()}}
+    return {**outcomes.columns(), "collisions": collisions.cpu().numpy()}
+
+
+class Outcomes:
+    """How and when the episodes of a view end, and the way that they took."""
+
+    def __init__(self, view: View, duration: float, reach: float) -> None:
+        """Starts the count.
+
+        Args:
+            view: All episodes, none of them ended.
+            duration: Longest episode, s.
+            reach: Distance to the goal that is success, in 3D, m.
+        """
+        count, device = len(view.episode), view.goal.device
+        self._view, self._duration, self._reach = view, duration, reach
+        self._success_time = torch.full((count,), torch.nan, dtype=torch.float64, device=device)
+        self._time = torch.full((count,), duration, dtype=torch.float64, device=device)
+        self._path = torch.zeros(count, dtype=torch.float64, device=device)
+        self._final = torch.zeros(count, dtype=torch.float64, device=device)
+        self._fell = torch.zeros(count, dtype=torch.bool, device=device)
+        self._running = torch.ones(count, dtype=torch.bool, device=device)
+        self.left = count
+        """Episodes that still run."""
+
+    def steps(self, progress: Progress | None) -> Iterator[int]:
+        """Numbers of the steps, from 1, until no episode runs."""
+        period = self._view.env.period
+        limit = round(self._duration / period)
+        for step in range(1, limit + 1):
+            yield step
+            if progress:
+                reached = float((~self._success_time.isnan()).double().mean())
+                progress(step if self.left else limit, limit, f"reached {reached:.0%}, running {self.left}")
+            if not self.left:
+                return
+
+    def alive(self) -> Tensor:
+        """(A,) the episode of a row of the view still runs."""
+        return self._running[self._view.episode]
+
+    def add(self, before: Tensor) -> None:
+        """Counts the step that the robots just made from ``before`` (A, 2), m."""
+        view, robot, row, alive = self._view, self._view.robot, self._view.episode, self.alive()
+        moved = torch.linalg.vector_norm(robot.position[:, :2] - before, dim=1).double()
+        self._path[row] += torch.where(alive, moved, 0.0)
+        distance = torch.linalg.vector_norm(view.goal_position - robot.position, dim=1)
+        reached = (distance < self._reach) & alive & ~robot.fallen
+        over = alive & robot.fallen
+        now = view.step * view.env.period
+        self._success_time[row[reached]] = now
+        self._time[row[reached | over]] = now
+        self._fell[row[over]] = True
+        ended = reached | over | (alive & (view.step == round(self._duration / view.env.period)))
+        if ended.any():
+            self._final[row[ended]] = view.geodesic()[0].double()[ended]
+            self._running[row[ended]] = False
+            self.left = int(self._running.sum())
+
+    def columns(self) -> dict[str, NDArray]:
+        """One array (n,) for each of outcome, success_time, time, path_length (planar, sampled once per period) and
+        final_distance (geodesic)."""
+        success = ~self._success_time.isnan().cpu().numpy()
+        measured = {
+            "success_time": self._success_time,
+            "time": self._time,
+            "path_length": self._path,
+            "final_distance": self._final,
+        }
+        return {
+            "outcome": np.where(success, "success", np.where(self._fell.cpu().numpy(), "fall", "timeout")),
+            **{name: value.cpu().numpy() for name, value in measured.items()},
+        }

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from romnav import random
 from romnav.evaluation.episodes import EpisodeSet
-from romnav.evaluation.rollout import Driver, Progress, View
+from romnav.evaluation.rollout import Driver, Outcomes, Progress, View
 from romnav.evaluation.spec import TrialSpec
 from romnav.navigation.observations import rotate
 from romnav.navigation.spec import EnvSpec
@@ -216,32 +216,25 @@ def _drive(
     progress: Progress | None,
 ) -> tuple[dict[str, NDArray], _Log]:
     count, limit = len(episodes), round(spec.duration / env.period)
-    device = world.node.device
     robot = BodyModel(world, count, env.period, spec.body)
     view = TrialView(world, episodes, env, robot)
     view.noise = view.episode % (count // 2)
-    filtered = filtered.to(device)
+    filtered = filtered.to(view.episode.device)
     guarded = filtered.nonzero()[:, 0]
     shield = Shield(world, len(guarded), spec, env)
+    outcomes = Outcomes(view, spec.duration, spec.reach)
     log = _Log.of(limit, count)
-    success_time = torch.full((count,), torch.nan, dtype=torch.float64, device=device)
-    time = torch.full((count,), spec.duration, dtype=torch.float64, device=device)
-    path = torch.zeros(count, dtype=torch.float64, device=device)
-    final = torch.zeros(count, dtype=torch.float64, device=device)
-    fell = torch.zeros(count, dtype=torch.bool, device=device)
-    running = torch.ones(count, dtype=torch.bool, device=device)
     log.track[0] = _centimetres(robot.position)
-    for step in range(1, limit + 1):
+    for step in outcomes.steps(progress):
         command = driver.command(view)
         executed = command.clone()
-        row = view.episode
-        alive = running[row]
+        alive = outcomes.alive()
         if len(guarded):
             wanted = command[guarded, :2]
             pose = robot.tile[guarded], robot.position[guarded], robot.yaw[guarded]
             safe = shield(*pose, wanted, view.noise[guarded], step)
             executed[guarded, :2] = safe.velocity
-            at = row[guarded].cpu().numpy()
+            at = view.episode[guarded].cpu().numpy()
             live = alive[guarded]
             log.acts[step - 1, at] = ((safe.status != Status.UNCHANGED) & live).cpu().numpy()
             left, asked = (torch.linalg.vector_norm(v, dim=1) for v in (safe.velocity, wanted))
@@ -250,40 +243,20 @@ def _drive(
         robot.step(executed)
         view.previous = command
         view.step = step
-        moved = torch.linalg.vector_norm(robot.position[:, :2] - before, dim=1).double()
-        path[row] += torch.where(alive, moved, 0.0)
-        at = row.cpu().numpy()
+        at = view.episode.cpu().numpy()
         log.track[step, at] = _centimetres(robot.position)
         log.contact[step - 1, at] = ((robot.contacts > 0) & alive).cpu().numpy()
         log.brink[step - 1, at] = (robot.brink & alive).cpu().numpy()
-        distance = torch.linalg.vector_norm(view.goal_position - robot.position, dim=1)
-        reached = (distance < spec.reach) & alive & ~robot.fallen
-        over = alive & robot.fallen
-        success_time[row[reached]] = step * env.period
-        time[row[reached | over]] = step * env.period
-        fell[row[over]] = True
-        ended = reached | over | (alive & (step == limit))
-        if ended.any():
-            final[row[ended]] = view.geodesic()[0].double()[ended]
-            running[row[ended]] = False
-        left_over = int(running.sum())
-        if progress:
-            reached_share = float((~success_time.isnan()).double().mean())
-            progress(step, limit, f"reached {reached_share:.0%}, running {left_over}")
-        if left_over == 0:
-            break
-        if left_over < 0.85 * len(row):
-            keep = running[row].nonzero()[:, 0]
-            kept_guarded = running[row[guarded]].nonzero()[:, 0]
+        outcomes.add(before)
+        if 0 < outcomes.left < 0.85 * len(view.episode):
+            alive = outcomes.alive()
+            keep, kept_guarded = (rows.nonzero()[:, 0] for rows in (alive, alive[guarded]))
             view.select(keep)
             driver.select(keep)
             if len(kept_guarded):
                 shield.select(kept_guarded)
             guarded = filtered[view.episode].nonzero()[:, 0]
-    success = ~success_time.isnan().cpu().numpy()
-    outcome = np.where(success, "success", np.where(fell.cpu().numpy(), "fall", "timeout"))
-    measured = {"success_time": success_time, "time": time, "path_length": path, "final_distance": final}
-    return {"outcome": outcome, **{name: value.cpu().numpy() for name, value in measured.items()}}, log
+    return outcomes.columns(), log
 
 
 def _centimetres(position: Tensor) -> NDArray[np.int16]:
