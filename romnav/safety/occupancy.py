@@ -6,8 +6,9 @@ a neighbouring cell belongs to it if its lowest return is within a step, give or
 not ground in that sense (a table top, the storey below a railing) inherits the ground next to it; a return is
 an obstacle if it lies more than a step above the ground of its cell and lower than the robot's height.
 
-What has left the field of view is remembered for a while if the caller tells how the robot has moved: one return of
-each cell, carried along at its own place rather than its cell's, so that nothing is rounded twice.
+What has left the field of view is remembered if the caller tells how the robot has moved: one return of each cell,
+carried along at its own place rather than its cell's, so that nothing is rounded twice. It is forgotten after a while,
+but not so near to the robot that the sensor could not see it again.
 """
 
 from __future__ import annotations
@@ -124,17 +125,22 @@ def _recall(
     half: float,
     cell: float,
     calls: wp.int64,
+    blind: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
-    """Carry remembered returns into the frame of a robot that has moved, one call older."""
+    """Carry remembered returns into the frame of a robot that has moved, one call older unless it is blind there."""
     b, i, j = wp.tid()
     packed = before[b, i, j]
-    age = (packed >> wp.int64(32)) + wp.int64(1)
+    age = packed >> wp.int64(32)
     if age >= calls or not wp.isfinite(motion[b]):
         return
     side = 2.0 * half
     x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
     y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
+    if x * x + y * y > blind * blind:
+        age += wp.int64(1)
+        if age >= calls:
+            return
     c = wp.cos(motion[b][2])
     s = wp.sin(motion[b][2])
     _remember(c * x + s * y, c * y - s * x, age, half, cell, b, memory)
@@ -349,6 +355,7 @@ class Rasterizer:
                     half,
                     spec.cell,
                     spec.memory,
+                    spec.blind,
                 ],
                 outputs=[memory],
                 device=device,

@@ -28,7 +28,10 @@ class OccupancySpec(Config):
     """Height above the ground from which the robot passes beneath a return, m (A: the G1 stands 1.32 m)."""
     memory: int = Field(25, ge=1, lt=2**15)
     """Calls for which a return is remembered where the robot's motion is told (A: 5 s; 1 remembers nothing, as the
-    paper, which mentions no memory). The mounted LiDAR loses what is lower than 0.6 m half a metre ahead."""
+    paper, which mentions no memory)."""
+    blind: float = Field(0.7, ge=0)
+    """Distance within which a remembered return does not age, m (A: the mounted LiDAR loses what is 0.3 m high at
+    0.63 m; a robot held in front of a bench would walk into it once it were forgotten)."""
 
 
 class PoissonSpec(Config):

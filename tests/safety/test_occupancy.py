@@ -173,7 +173,8 @@ def test_what_was_seen_is_remembered_at_its_own_place():
     rasterizer = Rasterizer(2, spec)
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
     pose = np.zeros(3)
-    for call in range(16):
+    age = np.full(7, 99)
+    for call in range(24):
         before = pose
         if call:
             c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -181,7 +182,9 @@ def test_what_was_seen_is_remembered_at_its_own_place():
         c, s = np.cos(pose[2]), np.sin(pose[2])
         local = (poles - pose[:2]) @ np.array([[c, -s], [s, c]])
         points = floor[None].repeat(2, 1, 1)
+        age += np.hypot(*local.T) > spec.blind
         if call == 2:  # seen once, by the first robot alone
+            age[:] = 0
             seen = torch.from_numpy(np.column_stack([local, np.full(7, 0.8)])).float()
             points = torch.stack([torch.cat([floor, seen]), torch.cat([floor, floor[:7]])])
         c, s = np.cos(before[2]), np.sin(before[2])
@@ -190,13 +193,31 @@ def test_what_was_seen_is_remembered_at_its_own_place():
         occupied = rasterizer(points, motion=motion).occupied
         assert not occupied[1].any()
         expected = np.zeros((120, 120), bool)
-        if 2 <= call < 14:
-            cells = np.floor((local + 3.0) / 0.05 + 1e-9).astype(int)
+        if (age < 12).any():
+            cells = np.floor((local[age < 12] + 3.0) / 0.05 + 1e-9).astype(int)
             inside = ((cells >= 0) & (cells < 120)).all(axis=1)
             expected[tuple(cells[inside].T)] = True
         # a return within a tenth of a millimetre of a border may lie beyond it
         assert (occupied[0].numpy() != expected).sum() <= 2
         assert abs(int(occupied[0].sum()) - expected.sum()) <= 1
+    assert (age >= 12).all()
+
+
+def test_what_is_below_the_sensors_view_is_not_forgotten_before_the_robot_has_left_it():
+    spec = OccupancySpec(memory=5)
+    rasterizer = Rasterizer(1, spec)
+    floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()[None]
+    near, far = torch.tensor([[0.5, 0.0, 0.4], [1.5, 0.0, 0.4]])
+    rasterizer(torch.cat([floor, near[None, None], far[None, None]], dim=1))
+    still, back = torch.zeros(1, 3), torch.tensor([[-0.5, 0.0, 0.0]])
+    for call in range(1, 200):
+        occupied = rasterizer(floor, motion=still).occupied[0]
+        assert occupied[70, 60]
+        assert occupied[90, 60] == (call < 5)
+    assert rasterizer(floor, motion=back).occupied[0, 80, 60]
+    for _ in range(5):
+        occupied = rasterizer(floor, motion=still).occupied[0]
+    assert not occupied.any()
 
 
 def test_without_motion_nothing_is_remembered():
