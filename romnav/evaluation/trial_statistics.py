@@ -80,10 +80,15 @@ def difference(rows: TrialRows, scene: str, event: Event, resamples: int = 10_00
     )
 
 
+def held_trials(rows: TrialRows, scene: str) -> np.ndarray:
+    """Trials that end with the filter holding the robot."""
+    return np.flatnonzero(rows.of(scene, True)["blocked"])
+
+
 def closed_routes(rows: TrialRows, scene: str) -> np.ndarray:
-    """Trials that the filter took from the robot: with it blocked, without it solved untouched."""
-    off, on = rows.of(scene, False), rows.of(scene, True)
-    return np.flatnonzero(on["blocked"] & (off["outcome"] == "success") & (off["collisions"] == 0))
+    """Trials that the filter took from the robot: held with it, solved untouched without it."""
+    held, off = held_trials(rows, scene), rows.of(scene, False)
+    return held[(off["outcome"][held] == "success") & (off["collisions"][held] == 0)]
 
 
 def _happened(rows: TrialRows, scene: str, filtered: bool, event: Event) -> np.ndarray:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
 from romnav.evaluation.trial_rows import TrialRows
-from romnav.evaluation.trial_statistics import closed_routes, summarise
+from romnav.evaluation.trial_statistics import closed_routes, held_trials, summarise
 from romnav.report.pictures import project, render
 from romnav.world.scenes.scene import Scene
 
@@ -28,7 +28,8 @@ SOLID, HANGING = "#7d8da3", "#c9b6d9"
 
 
 def draw_safety(run: TrialRows, scenes: Sequence[Scene], path: Path) -> None:
-    """Draw the shared trials of every obstacle set, filter off and on, and a route that the filter closes, if any."""
+    """Draw the shared trials of every obstacle set, filter off and on, and one that ends with the filter holding the
+    robot, if any: rather one that it solves untouched without the filter."""
     figure = Figure(figsize=(4.1 * len(scenes), 11.2), layout="constrained")
     axes = figure.subplots(3, len(scenes), squeeze=False)
     for scene, column in zip(scenes, axes.T, strict=True):
@@ -41,13 +42,16 @@ def draw_safety(run: TrialRows, scenes: Sequence[Scene], path: Path) -> None:
             ax.set_title(
                 f"{scene.label}, {state}: {s.successes}/{s.n} reached, {s.collided}/{s.n} collided", fontsize=9
             )
-        closed, ax = closed_routes(run, scene.name), column[2]
+        closed, held, ax = closed_routes(run, scene.name), held_trials(run, scene.name), column[2]
+        shown = int([*closed, *held][0]) if len(held) else None
         _draw_plan(ax, scene)
-        for filtered in (False, True) if len(closed) else ():
-            _draw_trial(ax, run, scene.name, filtered, int(closed[0]))
+        for filtered in (False, True) if shown is not None else ():
+            _draw_trial(ax, run, scene.name, filtered, shown)
+        example = "" if shown is None else f"\n(trial {shown})"
         trials = summarise(run, scene.name, True).n
-        shown = f": trial {closed[0]}" if len(closed) else ""
-        ax.set_title(f"route closed by the filter, {len(closed)} of {trials}{shown}", fontsize=9)
+        ax.set_title(
+            f"held by the CBF: {len(held)} of {trials}, {len(closed)} of them untouched without it{example}", fontsize=9
+        )
     handles = [
         Line2D([], [], color=OFF, label="filter off"),
         Line2D([], [], color=ON, label="filter on"),

@@ -7,7 +7,15 @@ import re
 from collections.abc import Mapping, Sequence
 
 from romnav.evaluation.trial_rows import TrialRows
-from romnav.evaluation.trial_statistics import Difference, Event, Summary, closed_routes, difference, summarise
+from romnav.evaluation.trial_statistics import (
+    Difference,
+    Event,
+    Summary,
+    closed_routes,
+    difference,
+    held_trials,
+    summarise,
+)
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
 from romnav.world.scenes.scene import Scene
@@ -36,8 +44,10 @@ def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
             cells = (_of(p["successes"], SHARED), _of(p["collisions"], SHARED), _time(p["time"], p["time_std"], 1))
             published.append(Row(f"{scene.label}, {arm}", (*cells, *_dashes(3))))
     blocks.append(Block("paper", "Paper (hardware)", tuple(published)))
-    closed = "; ".join(
-        f"{_name(run, labels)} {sum(len(closed_routes(run, scene.name)) for scene in scenes)}" for run in runs
+    held = "; ".join(
+        f"{_name(run, labels)} "
+        + " and ".join(str(sum(len(of(run, scene.name)) for scene in scenes)) for of in (held_trials, closed_routes))
+        for run in runs
     )
     trials = len(runs[0].of(scenes[0].name, False)["trial"])
     caption = (
@@ -45,7 +55,8 @@ def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
         "Collision: trials in which the body, a cylinder of 0.26 m, touches a solid. Time to goal is mean ± standard "
         f"deviation over successes. The first {SHARED} trials are shown as in the paper, and all {trials} in percent "
         "with 95% Wilson intervals; differences are paired, with 95% bootstrap intervals († excludes zero). "
-        f"Trials that end with the filter holding a robot which arrives untouched without it: {closed}."
+        "Trials that end with the filter holding the robot, and those of them that it solves untouched without it: "
+        f"{held}."
     )
     provenance, note = _provenance(runs, "trials")
     return Table(

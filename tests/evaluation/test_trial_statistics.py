@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from romnav.evaluation.trial_statistics import closed_routes, difference, summarise
+from romnav.evaluation.trial_statistics import closed_routes, difference, held_trials, summarise
 
 
 def test_summary_counts_the_rows(trial_run) -> None:
@@ -41,6 +41,7 @@ def test_closed_routes_are_those_solved_untouched_without_the_filter(trial_run) 
     ]
     assert 0 < len(expected) < on["blocked"].sum()
     assert closed_routes(run, "in-distribution").tolist() == expected
+    assert held_trials(run, "in-distribution").tolist() == np.flatnonzero(on["blocked"]).tolist()
 
 
 def test_nothing_to_average_is_nan(trial_run) -> None:

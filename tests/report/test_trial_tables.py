@@ -35,8 +35,9 @@ def test_safety_shows_ten_trials_as_the_paper_and_all_with_intervals(trial_run, 
     assert "RoM, training seed 0" in rom.title
     assert [cell.text for cell in published.rows[3].cells[:3]] == ["10/10", "0/10", "11.0 ± 5.8"]
     assert [cell.text for cell in published.rows[4].cells[:3]] == ["10/10", "4/10", "5.5 ± 1.0"]
+    held = sum(int(runs[0].of(scene.name, True)["blocked"].sum()) for scene in scenes)
     closed = sum(len(closed_routes(runs[0], scene.name)) for scene in scenes)
-    assert f"RoM {closed};" in table.caption
+    assert f"RoM {held} and {closed};" in table.caption
 
 
 def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run) -> None:
