@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import multiprocessing
 import os
@@ -27,6 +28,16 @@ def arguments(description: str | None, **options: int) -> argparse.Namespace:
         parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
     parser.add_argument("--out", type=Path, default=ROOT / "results/bench")
     return parser.parse_args()
+
+
+def importable(module: str) -> bool:
+    """Whether a peer can be used; says why not, as where its package or a library of the system is missing."""
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        print(f"left out: {module} ({error})")
+        return False
+    return True
 
 
 def take_turns(

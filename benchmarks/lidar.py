@@ -10,7 +10,6 @@ installed are left out: ``pip install romnav[bench]`` brings them.
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
-from _common import CORES, arguments, report
+from _common import CORES, arguments, importable, report
 from numpy.typing import NDArray
 
 from romnav.sensing.lidar import Lidar
@@ -189,7 +188,7 @@ def measure(name: str, solids: list[Solids], poses: Poses, repeats: int, out: Pa
     spec = LidarSpec(rows=rows, columns=columns, field=(-90.0, 90.0))
     lidar = Lidar(solids, spec)
     mesh = Lidar(solids, spec.model_copy(update={"backend": "mesh"}))
-    casts = {k: [make(s) for s in solids] for k, make in PEERS.items() if importlib.util.find_spec(MODULES[k])}
+    casts = {k: [make(s) for s in solids] for k, make in PEERS.items() if importable(MODULES[k])}
     ranges = lidar.scan(*poses).numpy()
     times: dict[str, list[float]] = {k: [] for k in ("romnav", "wp.mesh_query_ray", *casts)}
     agree = {}

@@ -9,7 +9,6 @@ it is not installed (``pip install romnav[bench]``).
 
 from __future__ import annotations
 
-import importlib.util
 import statistics
 import time
 from collections import defaultdict
@@ -22,7 +21,7 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 import torch
-from _common import arguments, report, take_turns
+from _common import arguments, importable, report, take_turns
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu, spsolve
 
@@ -138,7 +137,7 @@ class Osqp:
 
 def peers_of_the_solve() -> dict[str, Callable[[System], NDArray]]:
     peers = {"scipy spsolve": superlu, "scipy splu, symmetric mode": superlu_symmetric}
-    return peers | ({"pyamg, CG to 3e-3": amg} if importlib.util.find_spec("pyamg") else {})
+    return peers | ({"pyamg, CG to 3e-3": amg} if importable("pyamg") else {})
 
 
 def latency(repeats: int, out: Path) -> bool:
