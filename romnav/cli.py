@@ -417,9 +417,10 @@ def _execute(plan: Plan, targets: list[Stage], device: str, resume: bool, kinds:
 
 
 def _pending(targets: list[Stage], resume: bool, kinds: Collection[str]) -> list[Stage]:
-    from romnav.experiment.run import pending
+    from romnav.experiment.run import pending, require_walking
 
     stages = pending(targets, () if resume else kinds)
+    require_walking(stages)
     if not stages:
         typer.echo("nothing to do: everything is finished and up to date", err=True)
     return stages

@@ -19,7 +19,7 @@ from romnav.navigation.observations import goal_observation
 from romnav.navigation.perception import LidarPerception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.spec import EnvSpec
-from romnav.robot.dynamics import Dynamics
+from romnav.robot.dynamics import Body, Dynamics
 from romnav.robot.rom import ReducedOrderModel
 from romnav.threads import torch_threads
 from romnav.world.geodesic import GeodesicLookup
@@ -137,20 +137,29 @@ def evaluate(
     env: EnvSpec,
     spec: EvaluationSpec,
     progress: Progress | None = None,
+    body: Body = ReducedOrderModel,
 ) -> dict[str, NDArray]:
-    """Drive all ``episodes`` once; an episode ends at success, at a fall or after ``spec.duration``.
+    """Drive all ``episodes`` once on robots that ``body`` makes.
+
+    An episode ends at success, at a fall or after ``spec.duration``.
 
     Returns:
         One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
     """
     with torch_threads(spec.threads):
-        return _evaluate(driver, world, episodes, env, spec, progress)
+        return _evaluate(driver, world, episodes, env, spec, progress, body)
 
 
 def _evaluate(
-    driver: Driver, world: World, episodes: EpisodeSet, env: EnvSpec, spec: EvaluationSpec, progress: Progress | None
+    driver: Driver,
+    world: World,
+    episodes: EpisodeSet,
+    env: EnvSpec,
+    spec: EvaluationSpec,
+    progress: Progress | None,
+    body: Body,
 ) -> dict[str, NDArray]:
-    view = View(world, episodes, env)
+    view = View(world, episodes, env, body(world, len(episodes), env.period))
     outcomes = Outcomes(view, spec.duration, spec.reach)
     collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
     for step in outcomes.steps(progress):

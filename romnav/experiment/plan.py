@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from romnav.config import Config
 from romnav.errors import RomnavError
@@ -166,8 +166,13 @@ class Plan:
             upstream=(walked,),
         )
 
+    def _walking(self, settings: Scale) -> tuple[Stage, ...]:
+        """What robots of these settings need to walk."""
+        return (self.locomotion(), self.gaits()) if settings.navigation.dynamics == "g1" else ()
+
     def policy(self, arm: str, seed: int) -> Stage:
-        """The trained policy of an arm."""
+        """The trained policy of an arm, or of the one whose policy it drives."""
+        arm = self.project.driver(arm)
         settings = self.settings(arm)
         pretrained = settings.navigation.encoder.pretrained
         folder = self.folder / arm / f"seed-{seed}"
@@ -179,7 +184,7 @@ class Plan:
             record=folder / "spec.json",
             settings=settings,
             uses=("world", "lidar", "navigation", *(() if pretrained else ("pretrain.encoder",))),
-            upstream=(self.encoder(settings),) if pretrained else (),
+            upstream=(*((self.encoder(settings),) if pretrained else ()), *self._walking(settings)),
             scratch=("checkpoint.pt", "curve.csv"),
             arm=arm,
             seed=seed,
@@ -190,21 +195,38 @@ class Plan:
         return self._driven("episodes", "episodes", "evaluation", (self.episode_set,), arm, seed)
 
     def trials(self, kind: TrialKind, arm: str, seed: int) -> Stage:
-        """The trials of a trained or scripted arm in scenes, with the safety filter off and on."""
+        """The trials of a trained or scripted arm in scenes, with the safety filter off and on.
+
+        Raises:
+            RomnavError: The arm is another one on another body; trials have a body of their own.
+        """
+        if (driver := self.project.driver(arm)) != arm:
+            raise RomnavError(
+                f"{self.project.file(self.project.having(arm)[0])}: arms.{arm}.policy: trials drive the "
+                f"reduced-order model with a body; name {driver} in its place"
+            )
         return self._driven("trials", kind, kind, SCENES, arm, seed)
 
     def _driven(self, kind: str, output: str, section: str, reads: tuple[Path, ...], arm: str, seed: int) -> Stage:
         """A stage that drives an arm and writes rows."""
-        settings: Config = self.scale.settings
         uses: tuple[str, ...] = (section,)
         upstream: tuple[Stage, ...] = ()
-        if arm in SCRIPTED:
+        driver = self.project.driver(arm)
+        if driver in SCRIPTED:
+            settings = self.scale.settings
             seed = 0
             uses += ("navigation.dynamics", "navigation.env")
         else:
             policy = self.policy(arm, seed)
-            settings = policy.settings
+            settings = cast(Scale, policy.settings)
             upstream = (*policy.upstream, policy)
+        if driver != arm:
+            body = {"dynamics": self.settings(arm).navigation.dynamics}
+            settings = settings.model_copy(update={"navigation": settings.navigation.model_copy(update=body)})
+            uses = (*dict.fromkeys((*uses, "navigation.dynamics")),)
+        if kind == "episodes":
+            present = {stage.name for stage in upstream}
+            upstream = (*(stage for stage in self._walking(settings) if stage.name not in present), *upstream)
         folder = self.folder / arm / f"seed-{seed}"
         return Stage(
             kind=kind,
@@ -243,7 +265,9 @@ class Plan:
             record=self.folder / "figures" / f"{name}.json",
             settings=experiment,
             uses=("title", "labels"),
-            upstream=tuple(self.policy(arm, seed) for arm in experiment.arms for seed in seeds),
+            upstream=tuple(
+                self.policy(name, seed) for name, arm in experiment.arms.items() if not arm.policy for seed in seeds
+            ),
         )
 
     def tables(self, name: str, seeds: Iterable[int]) -> Stage:

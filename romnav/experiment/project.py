@@ -63,9 +63,17 @@ class Project:
         known = {name for experiment in self.experiments.values() for name in experiment.arms}
         raise RomnavError(f"unknown arm {arm}{suggest(arm, {*known, *SCRIPTED})}")
 
+    def driver(self, arm: str) -> str:
+        """The arm whose policy drives ``arm``: itself, unless it says otherwise.
+
+        Raises:
+            RomnavError: There is no such arm.
+        """
+        return arm if arm in SCRIPTED else self.having(arm)[1].driver(arm)
+
     def seeds(self, arm: str) -> tuple[int, ...]:
         """Training seeds of an arm; a scripted one has only seed 0."""
-        return (0,) if arm in SCRIPTED else self.having(arm)[1].seeds
+        return (0,) if self.driver(arm) in SCRIPTED else self.having(arm)[1].seeds
 
     def overview(self) -> str:
         """Experiments, arms, and the training seeds evaluated at each scale, as text."""

@@ -68,6 +68,24 @@ def require_trained(evaluations: Iterable[Stage]) -> None:
             raise RomnavError(f"{policy.folder}: {policy.name} {reason}; run `romnav train policy {policy.arm}`")
 
 
+def require_walking(stages: Collection[Stage]) -> None:
+    """Checks that none of the stages to run needs a locomotion policy that would have to be trained first.
+
+    Raises:
+        RomnavError: One does; that training takes hours, so nobody should begin it by accident.
+    """
+    missing = {stage.name: stage for stage in stages if stage.kind == "locomotion"}
+    for stage in stages:
+        for walked in stage.upstream:
+            if stage.kind in ("policy", "episodes") and walked.name in missing:
+                changed = "; ".join(store.differences(walked))
+                reason = f"was trained with other settings ({changed})" if changed else "is not trained to the end"
+                raise RomnavError(
+                    f"{walked.folder}: the policy that walks the robots of {stage.name} {reason}; "
+                    "run `romnav train locomotion`"
+                )
+
+
 def execute(
     stages: Iterable[Stage],
     actions: Mapping[str, Action],

@@ -68,7 +68,7 @@ class ScaleFile:
         data = self._data
         shared, own = experiment.scales.get(self.name, {}), experiment.arms[name].changes
         for key, change in ((f"scales.{self.name}", shared), (f"arms.{name}", own)):
-            for common in ("evaluation", "safety", "deploy"):
+            for common in ("locomotion", "evaluation", "safety", "deploy"):
                 if common in change:
                     raise RomnavError(f"{file}: {key}.{common}: set it in the scale, all arms share it")
             data = _merge(data, change)

@@ -19,6 +19,9 @@ SCRIPTED = ("oracle", "straight")
 RESERVED = {*SCRIPTED, "encoder", "locomotion", "tables", "figures"}
 """Names of other folders beside those of the arms."""
 
+BODY = {"dynamics"}
+"""What an arm may change of the navigation section that drives the policy of another arm."""
+
 C = TypeVar("C", bound=Config)
 
 
@@ -27,6 +30,8 @@ class Arm(Config, extra="allow"):
 
     label: str
     """Name in lists."""
+    policy: str | None = None
+    """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -61,11 +66,18 @@ class Experiment(Config):
         """Label of every arm."""
         return {name: arm.label for name, arm in self.arms.items()}
 
+    def driver(self, arm: str) -> str:
+        """The arm whose policy drives ``arm``."""
+        return self.arms[arm].policy or arm
+
     @field_validator("arms")
     @classmethod
     def _free_names(cls, arms: dict[str, Arm]) -> dict[str, Arm]:
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
+        for name, arm in arms.items():
+            if arm.policy and arm.changes.keys() - {"navigation"} | arm.changes.get("navigation", {}).keys() - BODY:
+                raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
         return arms
 
 
@@ -77,11 +89,17 @@ def load_experiments(folder: Path) -> dict[str, Experiment]:
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
     experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
+    trained = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
     seen: dict[str, tuple[str, Arm]] = {}
     for name, experiment in experiments.items():
         for scale in experiment.scales.keys() - known:
             raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
         for arm_name, arm in experiment.arms.items():
+            if arm.policy and arm.policy not in trained:
+                raise RomnavError(
+                    f"{folder / name}.toml: arms.{arm_name}.policy: no arm {arm.policy} that is trained"
+                    f"{suggest(arm.policy, trained)}"
+                )
             first, same = seen.setdefault(arm_name, (name, arm))
             if (same.changes, experiments[first].scales) != (arm.changes, experiment.scales):
                 raise RomnavError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from romnav.evaluation.rollout import Driver
     from romnav.evaluation.rows import Provenance
     from romnav.navigation.perception import LidarPerception
+    from romnav.robot.dynamics import Body
     from romnav.sensing.depth import DepthCamera
     from romnav.sensing.lidar import Lidar
     from romnav.world.scenes.scene import Scene
@@ -170,6 +172,7 @@ class Stages:
             perception,
             stage.folder,
             stage.seed or 0,
+            body=self._body(stage, settings.navigation.ppo.threads),
             device=self.device,
             resume=self.resume,
             progress=progress,
@@ -185,7 +188,9 @@ class Stages:
         paired = episodes.load(self.plan.episode_set)
         world = episodes.terrain(paired, self.plan.episode_set, self._worlds).to(self.device)
         driver = self._driver(stage, world)
-        measured = rollout.evaluate(driver, world, paired, settings.navigation.env, settings.evaluation, progress)
+        spec = settings.evaluation
+        body = self._body(stage, spec.threads)
+        measured = rollout.evaluate(driver, world, paired, settings.navigation.env, spec, progress, body)
         provenance = self._provenance(stage, paired.digest)
         count = len(paired)
         columns: dict[str, Any] = {
@@ -272,13 +277,38 @@ class Stages:
         draw(runs[0], scenes, stage.folder / stage.outputs[-1])
         return {}
 
+    def _body(self, stage: Stage, threads: int) -> Body:
+        """What makes the robots of a stage.
+
+        Raises:
+            RomnavError: The humanoid is to walk on another device than the CPU.
+        """
+        from romnav.robot.rom import ReducedOrderModel
+
+        if cast(Scale, stage.settings).navigation.dynamics == "rom":
+            return ReducedOrderModel
+        if self.device != "cpu":
+            raise RomnavError(f"{stage.name}: the humanoid has no physics engine on {self.device} here; use cpu")
+        from romnav.robot.gaits import GaitLibrary
+        from romnav.robot.humanoid import Humanoid
+
+        above = {stage.kind: stage for stage in stage.upstream}
+        return partial(
+            Humanoid,
+            checkpoint=above["locomotion"].folder / "policy.pt",
+            gaits=GaitLibrary.load(above["gaits"].folder / "gaits.pt"),
+            seed=stage.seed or 0,
+            threads=threads,
+        )
+
     def _driver(self, stage: Stage, world: World) -> Driver:
         """The policy or script of the arm of a stage."""
         from romnav.evaluation import rollout
         from romnav.navigation import checkpoint
 
-        if stage.arm in SCRIPTED:
-            return rollout.SCRIPTED[str(stage.arm)]()
+        driver = self.plan.project.driver(str(stage.arm))
+        if driver in SCRIPTED:
+            return rollout.SCRIPTED[driver]()
         trained = stage.upstream[-1]
         perception = self._perception(trained, cast(Scale, stage.settings), world, EVALUATION_NOISE)
         actor = checkpoint.load_actor(trained.folder / "policy.pt", perception.encoder, self.device)
@@ -290,7 +320,7 @@ class Stages:
 
         facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
         policy = None
-        if stage.arm not in SCRIPTED:
+        if self.plan.project.driver(str(stage.arm)) not in SCRIPTED:
             policy = stage.upstream[-1].folder / "policy.pt"
             record = store.read(stage.upstream[-1])
             facts = record.facts if record else facts
@@ -320,8 +350,9 @@ class Stages:
 
         corruption = Corruption(settings.navigation.corruption, noise, self.device)
         lidar, spec = self._lidar(settings, world.tiles), settings.pretrain.encoder
-        if policy.upstream:
-            encoder = encoders.load(policy.upstream[0].folder / "encoder.pt", spec, self.device)
+        pretrained = [above for above in policy.upstream if above.kind == "encoder"]
+        if pretrained:
+            encoder = encoders.load(pretrained[0].folder / "encoder.pt", spec, self.device)
         else:
             encoder = encoders.untrained(spec, lidar.directions, policy.seed or 0).encoder.to(self.device)
         return LidarPerception(lidar, corruption, encoder.requires_grad_(False))

@@ -103,7 +103,7 @@ class NavigationEnv(VecEnv):
             "length": self.episode_length_buf.clone(),
             "reward_steps": self._reward_steps,
             **{name: getattr(self, name).clone() for name in self._TENSORS},
-            **{f"dynamics.{name}": getattr(self.dynamics, name).clone() for name in self._DYNAMICS},
+            **{f"dynamics.{name}": value for name, value in self.dynamics.state_dict().items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -113,8 +113,8 @@ class NavigationEnv(VecEnv):
         self._reward_steps = state["reward_steps"]
         for name in self._TENSORS:
             setattr(self, name, state[name].clone())
-        for name in self._DYNAMICS:
-            setattr(self.dynamics, name, state[f"dynamics.{name}"].clone())
+        of_dynamics = {k.removeprefix("dynamics."): v for k, v in state.items() if k.startswith("dynamics.")}
+        self.dynamics.load_state_dict(of_dynamics)
         self._geodesic, self._direction = self._measure()
 
     _TENSORS = (
@@ -130,7 +130,6 @@ class NavigationEnv(VecEnv):
         "_finished",
         "_reward_sums",
     )
-    _DYNAMICS = ("tile", "layer", "position", "yaw", "contacts", "fallen")
 
     def get_observations(self) -> TensorDict:
         """Observations of the present state."""

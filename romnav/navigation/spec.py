@@ -143,8 +143,8 @@ class PPOSpec(Config):
 class NavigationSpec(Config):
     """Everything that the navigation stage needs beside world, sensors and encoder."""
 
-    dynamics: Literal["rom"] = "rom"
-    """The body that is driven."""
+    dynamics: Literal["rom", "g1"] = "rom"
+    """The body that is driven: the reduced-order model, or the humanoid under its frozen locomotion policy."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""

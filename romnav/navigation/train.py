@@ -20,6 +20,7 @@ from romnav.navigation.env import NavigationEnv
 from romnav.navigation.perception import LidarPerception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
 from romnav.navigation.spec import NavigationSpec
+from romnav.robot.dynamics import Body
 from romnav.robot.rom import ReducedOrderModel
 from romnav.threads import torch_threads
 from romnav.world.world import World
@@ -37,11 +38,12 @@ def train(
     out: Path,
     seed: int,
     *,
+    body: Body = ReducedOrderModel,
     device: str = "cpu",
     resume: bool = True,
     progress: Progress | None = None,
 ) -> Path:
-    """Train one policy and write ``out/policy.pt`` and ``out/curve.csv``.
+    """Train one policy on robots that ``body`` makes, and write ``out/policy.pt`` and ``out/curve.csv``.
 
     ``out/checkpoint.pt`` holds the whole state of the run every two minutes: a run that is killed and started again
     ends in the same weights as one left alone. It is deleted at the end.
@@ -50,7 +52,7 @@ def train(
         RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written.
     """
     with torch_threads(spec.ppo.threads):
-        return _train(spec, world, perception, out, seed, device, resume, progress)
+        return _train(spec, world, perception, out, seed, body, device, resume, progress)
 
 
 def _train(
@@ -59,13 +61,14 @@ def _train(
     perception: LidarPerception,
     out: Path,
     seed: int,
+    body: Body,
     device: str,
     resume: bool,
     progress: Progress | None,
 ) -> Path:
     torch.manual_seed(seed)
     world = world.to(device)
-    dynamics = ReducedOrderModel(world, spec.env.envs, spec.env.period)
+    dynamics = body(world, spec.env.envs, spec.env.period)
     perception.images = False
     env = NavigationEnv(world, dynamics, perception, spec.env, seed, device)
     obs = env.get_observations()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from torch import Tensor
 
 from romnav.world.spawns import Start
+from romnav.world.world import World
 
 
 class Dynamics(Protocol):
@@ -39,3 +41,15 @@ class Dynamics(Protocol):
     def select(self, envs: Tensor) -> None:
         """Keep only the robots ``envs`` (K,), in that order."""
         ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that changes while stepping, as tensors."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken, to the bit."""
+        ...
+
+
+Body = Callable[[World, int, float], Dynamics]
+"""Makes the dynamics of a world, a number of robots and a control period, s."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,6 +26,7 @@ STEP_UP = 0.3
 FOOTING = 0.35
 """Distance from the side of a stair or ramp within which nobody is put on it, m."""
 _CLOCK, _FRAME = range(2)
+_STATE = ("tile", "layer", "position", "yaw", "contacts", "fallen", "_env", "_resets", "_first")
 
 
 class Humanoid:
@@ -183,7 +185,7 @@ class Humanoid:
     def select(self, envs: Tensor) -> None:
         """Keep only the robots ``envs`` (K,), in that order."""
         state, walking = self.robots.state_dict(), self.control.snapshot(envs)
-        for name in ("tile", "layer", "position", "yaw", "contacts", "fallen", "_env", "_resets", "_first"):
+        for name in _STATE:
             setattr(self, name, getattr(self, name)[envs])
         self.robots = self._batch(len(envs))
         self.control = Controller(self._spec, self.robots)
@@ -191,3 +193,24 @@ class Humanoid:
         self.control.restore(torch.arange(len(envs)), walking)
         # After `restore`, which forgets contacts and the solver's warm start.
         self.robots.load_state_dict({name: value[envs.numpy()] for name, value in state.items()})
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that changes while stepping."""
+        own = {name: getattr(self, name).clone() for name in _STATE}
+        physics = {f"physics.{name}": torch.from_numpy(value) for name, value in self.robots.state_dict().items()}
+        walker = self.control.snapshot(torch.arange(len(self.tile)))
+        return own | physics | {f"walker.{name}": value for name, value in walker.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+        for name in _STATE:
+            setattr(self, name, state[name].clone())
+        self._enter_tiles()
+        parts: dict[str, dict[str, Tensor]] = {"physics": {}, "walker": {}}
+        for name, value in state.items():
+            if "." in name:
+                part, key = name.split(".")
+                parts[part][key] = value
+        self.control.restore(torch.arange(len(self.tile)), parts["walker"])
+        # After `restore`, which forgets contacts and the solver's warm start.
+        self.robots.load_state_dict({name: value.numpy() for name, value in parts["physics"].items()})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,7 @@ from romnav.world.world import World
 
 SUBSTEPS = 2
 """Half cells at top speed: a step never jumps over an occupied cell."""
+_STATE = ("tile", "layer", "position", "yaw", "contacts", "fallen")
 
 
 class ReducedOrderModel:
@@ -41,8 +44,17 @@ class ReducedOrderModel:
 
     def select(self, envs: Tensor) -> None:
         """Keep only the robots ``envs`` (K,), in that order."""
-        for name in ("tile", "layer", "position", "yaw", "contacts", "fallen"):
+        for name in _STATE:
             setattr(self, name, getattr(self, name)[envs])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that changes while stepping."""
+        return {name: getattr(self, name).clone() for name in _STATE}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+        for name in _STATE:
+            setattr(self, name, state[name].clone())
 
     def step(self, command: Tensor) -> None:
         """Integrate the command (E, 3) for one period."""

@@ -170,3 +170,57 @@ def test_unknown_names_are_one_clear_error(tmp_path: Path) -> None:
     fresh = Plan(Project(tmp_path, tmp_path / "results"), here.scale)
     with pytest.raises(RomnavError, match="unknown table spawngoal-prf-rom; did you mean spawngoal-perf-rom"):
         fresh.tables("spawn-goal", [0])
+
+
+HUMANOID = """
+kind = "ablation"
+title = "t"
+tables = ["spawngoal-perf-rom"]
+[arms.walked]
+label = "RoM policy on the G1"
+policy = "rom"
+navigation.dynamics = "g1"
+[arms.guided]
+label = "Oracle on the G1"
+policy = "oracle"
+navigation.dynamics = "g1"
+[arms.own]
+label = "Trained on the G1"
+navigation.dynamics = "g1"
+"""
+
+
+def test_a_policy_drives_another_body_without_being_trained_again(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    here.project.file("humanoid").write_text(HUMANOID)
+    walked, own = here.episodes("walked", 3), here.episodes("own", 0)
+    assert [stage.name for stage in walked.upstream] == [
+        "locomotion", "gait library", "encoder lidar", "policy rom, seed 3"
+    ]  # fmt: skip
+    assert walked.upstream[-1] == here.policy("rom", 3)
+    assert walked.settings.navigation.dynamics == "g1"  # type: ignore[attr-defined]
+    assert {stage.name for stage in own.upstream} == {
+        "locomotion",
+        "gait library",
+        "encoder lidar",
+        "policy own, seed 0",
+    }
+    assert "locomotion" in everything(here.policy("own", 0))
+    assert "locomotion" not in everything(here.episodes("rom", 3))
+    assert [stage.name for stage in here.episodes("guided", 3).upstream] == ["locomotion", "gait library"]
+    assert here.episodes("guided", 3).folder == here.episodes("guided", 0).folder
+    assert here.episodes("guided", 0).key != here.episodes("oracle", 0).key
+
+
+def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    here.project.file("humanoid").write_text(HUMANOID)
+    before, after = (
+        everything(Plan(here.project, plan(tmp_path, SCALE + more).scale).tables("humanoid", [0]))
+        for more in ("", "[locomotion]\niterations = 9\n")
+    )
+    changed = {name.removesuffix(", seed 0") for name in before if before[name] != after[name]}
+    walking = {"episodes walked", "episodes guided", "episodes own", "policy own"}
+    assert changed == {"locomotion", "gait library", "tables humanoid"} | walking
+    with pytest.raises(RomnavError, match=r"arms\.walked\.policy: trials drive .*; name rom in its place"):
+        here.trials("safety", "walked", 0)

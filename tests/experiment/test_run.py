@@ -15,7 +15,7 @@ from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.experiment import store
 from romnav.experiment.plan import Stage
-from romnav.experiment.run import execute, pending, require_trained
+from romnav.experiment.run import execute, pending, require_trained, require_walking
 
 KEYS = "abcdef"
 
@@ -247,3 +247,18 @@ def test_evaluation_requires_trained_policies(tmp_path: Path) -> None:
     require_trained(evaluation(Settings()))
     with pytest.raises(RomnavError, match=r"a was trained with other settings \(a: 0 -> 1\)"):
         require_trained(evaluation(Settings(a=1)))
+
+
+def test_no_locomotion_policy_is_trained_by_accident(tmp_path: Path) -> None:
+    walked = stage(tmp_path, "a", Settings(), kind="locomotion")
+    library = stage(tmp_path, "b", Settings(), (walked,), kind="gaits")
+    episodes = stage(tmp_path, "c", Settings(), (walked, library), kind="episodes")
+    actions = dict.fromkeys(("locomotion", "gaits", "episodes"), Actions().copy_)
+    require_walking(pending([library]))
+    with pytest.raises(RomnavError, match=r"robots of c is not trained to the end; run `romnav train locomotion`"):
+        require_walking(pending([episodes]))
+    execute(pending([library]), actions)
+    require_walking(pending([episodes]))
+    changed = stage(tmp_path, "a", Settings(a=5), kind="locomotion")
+    with pytest.raises(RomnavError, match=r"trained with other settings \(a: 0 -> 5\)"):
+        require_walking(pending([stage(tmp_path, "c", Settings(), (changed,), kind="episodes")]))

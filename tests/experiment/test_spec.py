@@ -167,3 +167,19 @@ def test_the_projects_own_experiments_are_valid_at_every_scale() -> None:
         scale = ScaleFile(file.parent, file.stem)
         for name, experiment in project.experiments.items():
             assert [scale.changed(arm, experiment, project.file(name)) for arm in experiment.arms]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ('policy = "rmo"', "arms.slow.policy: no arm rmo that is trained; did you mean rom"),
+        ('policy = "slow"', "arms.slow.policy: no arm slow that is trained"),
+        ('policy = "rom"\nnavigation.ppo.gamma = 0.5', "can only change navigation.dynamics"),
+        ('policy = "rom"\nworld.tiles = 3', "can only change navigation.dynamics"),
+    ],
+)
+def test_an_arm_that_drives_another_ones_policy(tmp_path: Path, change: str, message: str) -> None:
+    text = EXPERIMENT.replace("navigation.env.command.forward = 0.5", change)
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(RomnavError, match=message):
+        load_experiments(tmp_path)

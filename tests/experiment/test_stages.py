@@ -7,6 +7,7 @@ from pathlib import Path
 
 import matplotlib.image
 import pytest
+import torch
 
 from romnav.errors import RomnavError
 from romnav.experiment import store
@@ -15,7 +16,11 @@ from romnav.experiment.project import Project
 from romnav.experiment.run import execute, pending
 from romnav.experiment.scales import ScaleFile
 from romnav.experiment.stages import Stages
+from romnav.robot.gaits import GaitLibrary
+from romnav.robot.humanoid import Humanoid
 from romnav.sensing.encoder import load
+from romnav.world.spawns import sample
+from romnav.world.spec import SamplerSpec
 
 SCALE = """
 [world]
@@ -62,6 +67,40 @@ def test_encoders_are_trained_and_judged(tmp_path: Path) -> None:
         record = store.read(here.encoder(sensor=sensor))
         assert record is not None
         assert record.facts == {"digest": encoder.digest()}
+
+
+ARMS = """
+kind = "ablation"
+title = "t"
+[arms.walked]
+label = "Oracle on the G1"
+policy = "oracle"
+navigation.dynamics = "g1"
+"""
+
+
+def test_the_humanoid_walks_on_the_locomotion_policy_of_its_scale(tmp_path: Path) -> None:
+    here = plan(
+        tmp_path,
+        "[world]\ntiles = 2\ngoals_per_tile = 2\n[locomotion]\niterations = 1\n"
+        "[locomotion.task]\nrobots = 4\nshares = {flat = 1.0}\n[locomotion.ppo]\nsteps = 2\nminibatches = 1\n",
+    )
+    here.project.file("humanoid").write_text(ARMS)
+    stages, stage = Stages(here, "cpu"), here.episodes("walked", 0)
+    with pytest.raises(RomnavError, match=r"gaits\.pt: no gait library; record one with `romnav train gaits`"):
+        stages._body(stage, 1)
+    execute(pending([here.locomotion()]), stages.actions)
+    GaitLibrary([]).save(here.gaits().folder / "gaits.pt")
+    world = stages.world(here.scale.settings.world)
+    robots = stages._body(stage, 1)(world, 2, 0.2)
+    robots.reset(
+        torch.arange(2), sample(world, SamplerSpec(), 0, torch.arange(2), torch.arange(2), torch.zeros(2).long())
+    )
+    robots.step(torch.zeros(2, 3))
+    assert isinstance(robots, Humanoid)
+    assert not robots.fallen.any()
+    with pytest.raises(RomnavError, match="no physics engine on cuda"):
+        Stages(here, "cuda")._body(stage, 1)
 
 
 def test_an_encoder_is_not_judged_on_its_training_terrain(tmp_path: Path) -> None:

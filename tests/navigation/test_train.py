@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,13 @@ from romnav.navigation.env import STATE_SIZE
 from romnav.navigation.policy import reduced_precision
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.rewards import TERMS
-from romnav.navigation.spec import EncoderUseSpec, NavigationSpec, RewardSpec
-from romnav.world.world import World
+from romnav.navigation.spec import EncoderUseSpec, EnvSpec, NavigationSpec, PolicySpec, PPOSpec, RewardSpec
+from romnav.robot.gaits import GaitLibrary
+from romnav.robot.humanoid import Humanoid
+from romnav.robot.locomotion.train import train as train_locomotion
+from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+from romnav.world.spec import WorldSpec
+from romnav.world.world import World, build
 
 from .conftest import TOKENS, FakePerception, fake_encoder
 
@@ -237,3 +243,34 @@ def test_policy_errors_name_file_and_fix(
     torch.save({"weights": 1}, tmp_path / "foreign.pt")
     with pytest.raises(RomnavError, match="key 'format' is not"):
         checkpoint.read(tmp_path / "foreign.pt")
+
+
+def test_a_run_on_the_humanoid_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped after half of its iterations: the robots walk on from where they were."""
+    monkeypatch.setattr(train, "SAVE_EVERY", 0.0)
+    world = build(WorldSpec(tiles=2, seed=5, goals_per_tile=4))
+    tiny = LocomotionSpec(
+        task=TaskSpec(robots=4, shares={"flat": 1.0}), ppo=PpoSpec(steps=2, epochs=1, minibatches=1), iterations=1
+    )
+    walk = train_locomotion(tiny, tmp_path, threads=1)
+    body = partial(Humanoid, checkpoint=walk, gaits=GaitLibrary([]), threads=1)
+    spec = NavigationSpec(
+        dynamics="g1",
+        env=EnvSpec(envs=3, duration=2.0),
+        policy=PolicySpec(attention=16, heads=2, queries=2, recurrent=16, hidden=16, critic=(16,)),
+        ppo=PPOSpec(iterations=2, steps=6, epochs=1, minibatches=3),
+    )
+
+    class Stop(Exception):
+        pass
+
+    def late(done: int, total: int, metric: str) -> None:
+        if done == total:
+            raise Stop
+
+    train.train(spec, world, FakePerception(), tmp_path / "whole", 1, body=body)
+    with pytest.raises(Stop):
+        train.train(spec, world, FakePerception(), tmp_path / "half", 1, body=body, progress=late)
+    assert checkpoint.read(tmp_path / "half" / "checkpoint.pt")["iterations"] == 1
+    train.train(spec, world, FakePerception(), tmp_path / "half", 1, body=body)
+    assert_same(weights(tmp_path / "whole"), weights(tmp_path / "half"))

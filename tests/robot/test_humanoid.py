@@ -145,3 +145,24 @@ def test_who_has_fallen_is_reported_and_stays_down(world: World, checkpoint: Pat
 def test_the_period_is_a_multiple_of_the_control_step(world: World, checkpoint: Path) -> None:
     with pytest.raises(RomnavError, match="multiple of the control step"):
         Humanoid(world, 1, 0.19, checkpoint, GaitLibrary([]), threads=1)
+
+
+def test_a_restored_batch_goes_on_as_if_it_had_never_stopped(world: World, checkpoint: Path) -> None:
+    """Through a saved state: also across a fall, a reset and another tile."""
+    first, second = robot(world, 3, checkpoint), robot(world, 3, checkpoint)
+    start = starts(world, level_nodes(world, 3), torch.tensor([0.0, 1.0, 2.0]))
+    command = torch.tensor([[0.4, 0.1, 0.5], [0.3, 0.0, 0.0], [-0.2, 0.0, 0.3]])
+    first.reset(torch.arange(3), start)
+    for _ in range(3):
+        first.step(command)
+    elsewhere = int(world.node_start[1]) + 50
+    first.reset(torch.tensor([2]), starts(world, torch.tensor([elsewhere]), torch.zeros(1)))
+    first.step(command)
+    second.load_state_dict({name: value.clone() for name, value in first.state_dict().items()})
+    for body in (first, second):
+        for _ in range(3):
+            body.step(command)
+        body.reset(torch.tensor([0]), starts(world, level_nodes(world, 1), torch.zeros(1)))
+        body.step(command)
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
