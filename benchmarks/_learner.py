@@ -38,11 +38,12 @@ def load_world(spec: WorldSpec, cache: Path = CACHE) -> World:
     return build(spec, cache)
 
 
-def sensors(s: Scale, world: World) -> LidarPerception:
+def sensors(s: Scale, world: World, *, bfloat16: bool = True) -> LidarPerception:
     """LiDAR, corruption and an encoder with random weights: what it computes costs the same as a trained one."""
     torch.manual_seed(0)
     lidar = Lidar([tile.solids for tile in world.tiles], s.lidar)
-    encoder = Autoencoder(s.pretrain.encoder, lidar.directions).encoder.eval().requires_grad_(False)
+    spec = s.pretrain.encoder.model_copy(update={"bfloat16": bfloat16})
+    encoder = Autoencoder(spec, lidar.directions).encoder.eval().requires_grad_(False)
     return LidarPerception(lidar, Corruption(s.navigation.corruption, 0), encoder)
 
 

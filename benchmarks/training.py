@@ -109,7 +109,7 @@ class StockActor(RNNModel):
 def stock(s: Scale, world: World) -> Learner:
     """The peer, with the weights that `ours` starts from."""
     template = ours(s, world).algorithm.actor
-    perception = sensors(s, world)
+    perception = sensors(s, world, bfloat16=False)  # rsl-rl computes in float32 throughout
     env = environment(s, world, Images(perception))
     obs = env.get_observations()
     ppo, policy = s.navigation.ppo, s.navigation.policy
@@ -157,33 +157,51 @@ def agreement(learners: Mapping[str, Learner], steps: int = 20) -> bool:
 
 
 class Stopwatch:
-    """Exclusive seconds in wrapped methods: what one of them spends in another counts there alone."""
+    """Exclusive seconds of nested spans: what is spent in an inner one counts there alone."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
-        self._inner = [0.0]
+        self._open: list[tuple[str, float, float]] = []
 
-    def wrap(self, owner: Any, method: str, label: str) -> None:
+    def begin(self, label: str) -> None:
+        self._open.append((label, time.perf_counter(), 0.0))
+
+    def end(self) -> None:
+        label, start, inner = self._open.pop()
+        whole = time.perf_counter() - start
+        self.seconds[label] += whole - inner
+        if self._open:
+            outer, began, before = self._open[-1]
+            self._open[-1] = outer, began, before + whole
+
+    def wrap(self, owner: Any, method: str, label: str, when: Callable[[], bool] = lambda: True) -> None:
+        """Time calls of a method, or those of them that happen ``when``."""
         call = getattr(owner, method)
         self.seconds[label] += 0.0
 
         def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            self._inner.append(0.0)
+            if not when():
+                return call(*args, **kwargs)
+            self.begin(label)
             try:
                 return call(*args, **kwargs)
             finally:
-                whole = time.perf_counter() - start
-                self.seconds[label] += whole - self._inner.pop()
-                self._inner[-1] += whole
+                self.end()
 
         setattr(owner, method, timed)
 
+    def wrap_learning(self, module: nn.Module, first: nn.Parameter, label: str) -> None:
+        """Time a module in updates, forwards and backwards; the gradient of ``first`` is the last that it makes."""
+        self.wrap(module, "forward", label, when=torch.is_grad_enabled)
+        module.register_full_backward_pre_hook(lambda *_: self.begin(label))
+        first.register_post_accumulate_grad_hook(lambda _: self.end())
+
 
 def shares(learner: Learner, iterations: int) -> dict[str, float]:
-    """Share of the time of each part; attention and GRU of the update are measured alone, with their gradients."""
+    """Share of the time of each part."""
     env: NavigationEnv = learner.env
     ppo, perception, watch = learner.algorithm, env.perception, Stopwatch()
+    actor: NavigationActor = ppo.actor
     watch.wrap(perception.lidar, "scan", "LiDAR")
     watch.wrap(perception, "corruption", "corruption")
     watch.wrap(perception.encoder, "tokens", "encoder")
@@ -194,40 +212,13 @@ def shares(learner: Learner, iterations: int) -> dict[str, float]:
     watch.wrap(ppo, "act", "policy inference")
     watch.wrap(ppo, "process_env_step", "storage, returns")
     watch.wrap(ppo, "compute_returns", "storage, returns")
-    watch.wrap(ppo, "update", "update")
+    watch.wrap_learning(actor.attention, actor.attention.embed.weight, "update: attention")
+    watch.wrap_learning(actor.core, actor.core.input[0].weight, "update: GRU")
+    watch.wrap(ppo, "update", "update: the rest")
     for _ in range(iterations):
         learner.iterate()
-    passes = iterations * ppo.num_learning_epochs * ppo.num_mini_batches
-    for label, seconds in alone(learner).items():
-        watch.seconds[f"update: {label}"] = passes * seconds
-        watch.seconds["update"] -= passes * seconds
-    watch.seconds["update: the rest"] = watch.seconds.pop("update")
     whole = sum(watch.seconds.values())
     return {label: seconds / whole for label, seconds in watch.seconds.items()}
-
-
-def alone(learner: Learner) -> dict[str, float]:
-    """Seconds of attention and of the GRU in one minibatch, forward and backward."""
-    actor: NavigationActor = learner.algorithm.actor
-    steps, envs = learner.steps, learner.env.num_envs // learner.algorithm.num_mini_batches
-    tokens = learner.obs["lidar"][:envs].float().repeat(steps, 1, 1)
-    state = torch.randn(steps * envs, actor.state_embedding[0].out_features, requires_grad=True)
-    seen = torch.randn(steps, envs, actor.core.input[0].in_features, requires_grad=True)
-    hidden, starts = torch.zeros(LAYERS, envs, actor.core.width), torch.zeros(steps, envs, dtype=torch.bool)
-
-    def least(work: Callable[[], Tensor]) -> float:
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            work().sum().backward()
-            times.append(time.perf_counter() - start)
-        actor.zero_grad()
-        return min(times)
-
-    return {
-        "attention": least(lambda: actor.attention(tokens, state)),
-        "GRU": least(lambda: actor.core(seen, hidden, starts)[0]),
-    }
 
 
 SENSING = ("LiDAR", "corruption", "encoder", "dynamics", "geodesic lookup", "resets", "observations, rewards")

@@ -45,8 +45,9 @@ def draw_safety(run: TrialRows, scenes: Sequence[Scene], path: Path) -> None:
         closed, held, ax = closed_routes(run, scene.name), held_trials(run, scene.name), column[2]
         shown = int([*closed, *held][0]) if len(held) else None
         _draw_plan(ax, scene)
-        for filtered in (False, True) if shown is not None else ():
-            _draw_trial(ax, run, scene.name, filtered, shown)
+        if shown is not None:
+            for filtered in (False, True):
+                _draw_trial(ax, run, scene.name, filtered, shown)
         example = "" if shown is None else f"\n(trial {shown})"
         trials = summarise(run, scene.name, True).n
         ax.set_title(
