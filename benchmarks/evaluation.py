@@ -1,7 +1,7 @@
 """Evaluation of one arm: 1,024 paired episodes of up to 120 s at the "cpu" scale.
 
 By default the policy has random weights. It reaches next to no goal, so that almost every episode runs to its end:
-no arm takes longer. With the folder of a trained arm, ``--arm results/cpu/rom/seed-0``, and its encoder, that policy
+no arm takes longer. With ``--policy`` and ``--encoder``, files of a trained arm, that policy
 drives, once under each backend of the LiDAR, and the paired difference of their success is reported beside the times.
 """
 

@@ -7,6 +7,7 @@ Library kernels are made for long sequences; among ten tokens of eight channels 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -77,18 +78,27 @@ def _backward(
         d_query[b, i, h] = d_q * scale
 
 
+@cache
+def _for_width(kernel: Any, vectors: int, kind: Any, device: str) -> Any:
+    """The kernel for vectors of one kind, compiled and loaded: two threads must not do that at once."""
+    concrete = wp.overload(kernel, [float, wp.array4d(dtype=float), *[wp.array3d(dtype=kind)] * vectors])
+    wp.load_module(device=device)
+    return concrete
+
+
 def _launch(kernel: Any, share: Tensor, *vectors: Tensor) -> None:
     """Run ``kernel`` on shares (B, heads, I, J) and tensors (B, tokens, heads, D), split over the threads on a CPU."""
     batch, heads = share.shape[:2]
     width = vectors[0].shape[3]
     device = str(share.device)
     kind = wp.types.vector(length=width, dtype=float)
+    of_width = _for_width(kernel, len(vectors), kind, device)
 
     def run(part: slice) -> None:
         arrays = [wp.from_torch(x[part], dtype=kind, requires_grad=False) for x in vectors]
         inputs = [width**-0.5, wp.from_torch(share[part]), *arrays]
         stream = wp.stream_from_torch(share.device) if share.is_cuda else None
-        wp.launch(kernel, (part.stop - part.start, heads), inputs, device=device, stream=stream)
+        wp.launch(of_width, (part.stop - part.start, heads), inputs, device=device, stream=stream)
 
     threads = 1 if share.is_cuda else torch.get_num_threads()
     bounds = [batch * k // threads for k in range(threads + 1)]
