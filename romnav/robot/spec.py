@@ -66,10 +66,18 @@ class GaitSpec(Config):
     """Limits of a foothold beside the stance foot, m."""
     edge_search: float = 0.14
     """How far a foothold may be moved along the heading to keep the sole off a stair's edge, m."""
+    edge_margin: float = 0.045
+    """Wanted distance of the sole from a riser before or behind it, m."""
     acceleration: tuple[float, float, float] = (0.8, 0.8, 1.5)
     """Fastest change of the command that the reference follows, m/s^2, m/s^2, rad/s^2."""
-    speed_gain: float = 1.0
-    """Commanded over orbit velocity in foot placement, -: makes up for what the real leg loses at touch-down."""
+    integral_gain: float = 1.0
+    """Of the velocity error into the orbit's velocity, 1/s."""
+    integral_limit: float = 0.3
+    """Largest correction of the orbit's velocity, m/s."""
+    integral_level: float = 0.03
+    """The error is integrated while the next foothold is not further above or below the feet, m."""
+    integral_decay: float = 0.5
+    """Time in which the integral decays elsewhere, s."""
     pull: float = 0.6
     """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's part."""
     early: float = 0.05
@@ -143,7 +151,7 @@ class TaskSpec(Config):
     """Longest episode, s."""
     action_scale: float = 0.3
     """Residual joint angle of one unit of action, rad."""
-    shares: dict[str, float] = Field(default={"flat": 0.22, "rough": 0.05, "ramp": 0.08, "stairs": 0.50, "uturn": 0.15})
+    shares: dict[str, float] = Field(default={"flat": 0.18, "rough": 0.04, "ramp": 0.06, "stairs": 0.52, "uturn": 0.20})
     """Share of the robots on each kind of terrain."""
     explore: float = 0.3
     """Share of the episodes on any level instead of the robot's own: steep stairs are tried before they are due."""
@@ -178,14 +186,17 @@ class PpoSpec(Config):
     """Per pass."""
     hidden: tuple[int, ...] = (256, 128, 64)
     """Widths of the policy and of the critic."""
-    learning_rate: tuple[float, float] = (2e-4, 1.5e-3)
+    learning_rate: tuple[float, float] = (5e-5, 1.5e-3)
     """Range of the adaptive rate; it starts at the floor."""
     desired_kl: float = 0.02
     """Of a whole iteration."""
     entropy: float = 0.0
     """Weight of the entropy (0.003 drives the noise up for ever, and noise costs stairs)."""
-    std: tuple[float, float, float] = (0.12, 0.25, 1.0)
+    std: tuple[float, float, float] = (0.2, 0.25, 1.0)
     """Floor, start and ceiling of the action noise, in units of action."""
+    average: float = 0.99
+    """Of the weights over iterations: the policy that is used is the mean of about the last hundred, which stays up on
+    stairs where the single ones come and go."""
     gamma: float = 0.99
     """Discount."""
     lam: float = 0.95

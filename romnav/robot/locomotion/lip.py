@@ -64,6 +64,12 @@ def capture_offset(command: Tensor, next_side: Tensor, duration: float, width: f
     return offset - lateral * width / (math.exp(w * duration) + 1.0)
 
 
+def integrate(integral: Tensor, error: Tensor, level: Tensor, spec: GaitSpec, dt: float) -> Tensor:
+    """Integral (n, 2) of the velocity error (n, 2) after `dt`, m/s; it decays where the ground is not level (n,)."""
+    change = torch.where(level[:, None], spec.integral_gain * error, -integral / spec.integral_decay)
+    return (integral + dt * change).clamp(-spec.integral_limit, spec.integral_limit)
+
+
 def smoothstep(t: Tensor) -> Tensor:
     """Minimum-jerk rise from 0 to 1 over t in [0, 1], clamped."""
     t = t.clamp(0.0, 1.0)
@@ -119,10 +125,11 @@ class Walker:
 
     `STATE` names what it remembers of each robot: the clock, where the swing foot left the ground, where it is
     to land, where the stance foot was to land and whether it has, the mean ground height at the start of the
-    step, the heading and velocity it follows, and the last solution of the inverse kinematics.
+    step, the heading and velocity it follows, the integral of the velocity's error, and the last solution of the
+    inverse kinematics.
     """
 
-    STATE = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "joints")
+    STATE = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "integral", "joints")
 
     def __init__(self, spec: GaitSpec, legs: Legs, control_dt: float, count: int) -> None:
         self.spec, self.legs = spec, legs
@@ -137,6 +144,7 @@ class Walker:
         self.base = torch.zeros(count)
         self.heading = torch.zeros(count)
         self.command = torch.zeros(count, 3)
+        self.integral = torch.zeros(count, 2)
         self.joints = self.stance().expand(count, 2, 6).clone()
 
     def stance(self) -> Tensor:
@@ -153,6 +161,7 @@ class Walker:
         `velocity` (k, 2), m/s, in the heading frame."""
         self.command[ids, :2] = velocity
         self.command[ids, 2] = 0.0
+        self.integral[ids] = 0.0
         self.clock[ids] = clock
         self.heading[ids] = heading
         self.joints[ids] = self.stance().expand(len(ids), 2, 6)
@@ -167,17 +176,23 @@ class Walker:
         return point[:, None] + offsets[..., None] * ahead[:, None]
 
     def _clear_of_edges(self, ground: Heights, point: Tensor, heading: Tensor, reach: Tensor, level: Tensor) -> Tensor:
-        """Move footholds (n, 2) along the heading to where the ground under the sole is nearest to a plane, not
-        more than a stair's riser from the `level` (n,) of the stance foot."""
+        """Move footholds (n, 2) along the heading to where the ground under the sole is nearest to a plane and no
+        riser is close to it, not more than a riser from the `level` (n,) of the stance foot.
+
+        The shin leans over the toes into the next riser's nose, and on the way down the heel catches on the last
+        one's; a drop beside the sole does no harm."""
         tries = torch.linspace(-1.0, 1.0, 15) * self.spec.edge_search
-        half = FOOT_LENGTH / 2 + 0.01
+        half, margin = FOOT_LENGTH / 2, self.spec.edge_margin * torch.tensor([0.5, 1.0])
         sole = torch.linspace(-half, half, 7)
-        at = self._along(point, heading, (tries[:, None] + sole).flatten())
-        height = ground(at, reach[:, None]).reshape(len(point), 15, 7)
-        line = height[..., :1] + (height[..., -1:] - height[..., :1]) * torch.linspace(0.0, 1.0, 7)
-        bump = (height - line).abs().amax(-1)
-        climb = ((height.amax(-1) - level[:, None]).abs() - self.spec.climb).clamp(min=0.0)
-        best = (tries.abs() + 8.0 * (bump - 0.015).clamp(min=0.0) + 20.0 * climb).argmin(1)
+        line = torch.cat([sole, half + margin, -half - margin])
+        at = self._along(point, heading, (tries[:, None] + line).flatten())
+        height = ground(at, reach[:, None]).reshape(len(point), len(tries), len(line))
+        heel, toe = height[..., :1], height[..., 6:7]
+        over = height - heel - (toe - heel) * (line + half) / (2 * half)
+        bump, riser = over[..., :7].abs().amax(-1), over[..., 7:].amax(-1)
+        climb = ((height[..., :7].amax(-1) - level[:, None]).abs() - self.spec.climb).clamp(min=0.0)
+        cost = 8.0 * (bump - 0.015).clamp(min=0.0) + 4.0 * (riser - 0.015).clamp(min=0.0) + 20.0 * climb
+        best = (tries.abs() + cost).argmin(1)
         return self._along(point, heading, tries[best][:, None])[:, 0]
 
     def update(self, robots: Robots, command: Tensor, ground: Heights, *, first: Tensor | None = None) -> Reference:
@@ -193,7 +208,7 @@ class Walker:
         rows = torch.arange(len(command))
         slew = torch.tensor(s.acceleration) * self.dt
         self.command = self.command + torch.maximum(torch.minimum(command - self.command, slew), -slew)
-        speed, turn = self.command[:, :2] * s.speed_gain, self.command[:, 2]
+        turn = self.command[:, 2]
         tick = self.clock % s.step_ticks
         stance_left = (self.clock // s.step_ticks) % 2 == 0
         side = torch.where(stance_left, 1.0, -1.0)
@@ -203,6 +218,12 @@ class Walker:
         start = (tick == 0) | fresh
 
         yaw = torch.atan2(robots.orientation[:, 1, 0], robots.orientation[:, 0, 0])
+        # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
+        # but not on stairs, where treads bound the steps and the integral would wind up.
+        error = self.command[:, :2] - turn_xy(robots.com_velocity[:, :2], -yaw)
+        level = ((self.foothold[:, 2] - self.base).abs() < s.integral_level) | fresh
+        self.integral = integrate(self.integral, error, level, s, self.dt)
+        speed = self.command[:, :2] + self.integral
         lead = wrap(self.heading + turn * self.dt - yaw).clamp(-0.35, 0.35)
         self.heading = wrap(yaw + lead)
         sole = self.soles(robots)
@@ -252,7 +273,7 @@ class Walker:
         between = (under[rows, stance] - self.foothold[:, 2]).abs()
         height = s.pelvis + self.base + (after - self.base) * smoothstep(phase) - s.sink * between
 
-        com, com_velocity = orbit(self.command[:, :2], side, phase * self.duration, self.duration, s.width, self.w)
+        com, com_velocity = orbit(speed, side, phase * self.duration, self.duration, s.width, self.w)
         pull = turn_xy(com + com_velocity / self.w, self.heading) - x - robots.com_velocity[:, :2] / self.w
         pull = s.pull * pull.clamp(-0.1, 0.1)
         joints = self._inverse(robots, rows, stance, swing, sole, p, foot, height, pull, landing, ground, reach)

@@ -434,8 +434,8 @@ class LocomotionEnv(VecEnv):
         up, down = own & (part > 0.45) & quick, own & fell[ids] & (part < 0.3)
         level = self.level[ids] + up.long() - down.long()
         top = self._top[ids]
-        # Beyond the top, practise all levels.
-        wander = (self._uniform(0.0, 1.0, len(ids)) * (top + 1)).long()
+        # Beyond the top, practise the harder half of the levels.
+        wander = (self._uniform(0.5, 1.0, len(ids)) * (top + 1)).long()
         self.level[ids] = torch.where(level > top, wander, level.clamp(min=0))
         for k, kind in enumerate(self.kinds):
             mine = self.kind[ids] == k

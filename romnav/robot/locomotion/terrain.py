@@ -153,10 +153,12 @@ def curriculum(rng: np.random.Generator) -> list[Lane]:
     lanes = [flat()]
     lanes += [rough(i, a, rng) for i, a in enumerate((0.02, 0.035, 0.05))]
     lanes += [ramp(i, a, 3.0) for i, a in enumerate((4.0, 7.0, 10.0, 13.0, 16.0))]
-    for i, riser in enumerate((0.03, 0.05, 0.07, 0.09, 0.11, 0.13, 0.15, 0.17, 0.185)):
-        treads = (0.27, 0.31) if i % 2 else (0.31, 0.27)
-        lanes.append(stairs(i, riser, *treads, steps=8))
-    lanes += [uturn(i, r, t, 6) for i, (r, t) in enumerate(((0.06, 0.3), (0.10, 0.31), (0.14, 0.29), (0.175, 0.27)))]
+    flights = (
+        (0.04, 0.31, 0.27), (0.07, 0.27, 0.31), (0.10, 0.31, 0.27), (0.12, 0.27, 0.31), (0.14, 0.31, 0.25),
+        (0.15, 0.25, 0.31), (0.17, 0.31, 0.25), (0.17, 0.25, 0.27), (0.185, 0.27, 0.31),
+    )  # fmt: skip
+    lanes += [stairs(i, *shape, steps=12 if shape[0] > 0.1 else 8) for i, shape in enumerate(flights)]
+    lanes += [uturn(i, r, t, 6) for i, (r, t) in enumerate(((0.08, 0.31), (0.13, 0.27), (0.155, 0.31), (0.175, 0.27)))]
     return lanes
 
 

@@ -83,7 +83,7 @@ def adapt(ppo: PPO, spec: PpoSpec) -> float:
 
 
 def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor], int]:
-    """Spec, deterministic policy (observation -> action) and iteration of a checkpoint.
+    """Spec, deterministic policy (observation -> action; averaged weights) and iteration of a checkpoint.
 
     Raises:
         RomnavError: the file is missing.
@@ -95,7 +95,7 @@ def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor],
     width = saved["ppo"]["actor_state_dict"]["obs_normalizer._mean"].shape[1]
     actions = saved["ppo"]["actor_state_dict"]["distribution.std_param"].shape[0]
     actor = make_actor(spec.ppo, TensorDict({"policy": torch.zeros(1, width)}, batch_size=[1]), actions)
-    actor.load_state_dict(saved["ppo"]["actor_state_dict"])
+    actor.load_state_dict({**saved["ppo"]["actor_state_dict"], **saved["average"]})
     actor.eval()
 
     def policy(obs: Tensor) -> Tensor:
@@ -113,8 +113,17 @@ def training_cost(path: Path) -> dict[str, Any]:
     return {"iterations": saved["iteration"], "steps": steps, "hours": round(saved["seconds"] / 3600, 3)}
 
 
-def _save(path: Path, spec: LocomotionSpec, ppo: PPO, env: LocomotionEnv, iteration: int, seconds: float) -> None:
+def _save(
+    path: Path,
+    spec: LocomotionSpec,
+    ppo: PPO,
+    average: dict[str, Tensor],
+    env: LocomotionEnv,
+    iteration: int,
+    seconds: float,
+) -> None:
     state = {
+        "average": average,
         "spec": spec.model_dump(), "iteration": iteration, "seconds": seconds, "ppo": ppo.save(),
         "learning_rate": ppo.learning_rate, "torch_random": torch.get_rng_state(), "env": env.state_dict(),
     }  # fmt: skip
@@ -157,13 +166,14 @@ def train(
     torch.manual_seed(spec.seed)
     env = LocomotionEnv(spec, curriculum(np.random.default_rng(spec.seed)), threads=threads)
     ppo = make_ppo(spec.ppo, env)
+    average = {name: weight.detach().clone() for name, weight in ppo.actor.named_parameters()}
     done, spent = 0, 0.0
     if resume and path.exists():
         saved = torch.load(path, weights_only=False)
         if {**saved["spec"], "iterations": 0} != {**spec.model_dump(), "iterations": 0}:
             raise RomnavError(f"{path}: trained by another specification; use another directory or --no-resume")
         ppo.load(saved["ppo"], None, strict=True)
-        ppo.learning_rate = saved["learning_rate"]
+        ppo.learning_rate, average = saved["learning_rate"], saved["average"]
         env.load_state_dict(saved["env"])
         torch.set_rng_state(saved["torch_random"])
         done, spent = saved["iteration"], saved["seconds"]
@@ -183,6 +193,8 @@ def train(
         collected = time.monotonic()
         losses = ppo.update()
         losses["kl"] = adapt(ppo, spec.ppo)
+        for name, weight in ppo.actor.named_parameters():
+            average[name].lerp_(weight.detach(), 1.0 - spec.ppo.average)
         row = _row(rows) | {
             "iteration": iteration, "steps": iteration * spec.ppo.steps * env.num_envs,
             "seconds": spent + time.monotonic() - begin, "collect": collected - clock,
@@ -194,7 +206,7 @@ def train(
             progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
         if time.monotonic() - mark > save_every or iteration == spec.iterations:
             mark = time.monotonic()
-            _save(path, spec, ppo, env, iteration, row["seconds"])
+            _save(path, spec, ppo, average, env, iteration, row["seconds"])
     return path
 
 

@@ -123,6 +123,20 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
         load_policy(tmp_path / "none.pt")
 
 
+def test_the_policy_that_is_used_has_the_weights_averaged_over_iterations(tmp_path: Path) -> None:
+    first, second = (
+        torch.load(train(SPEC.model_copy(update={"iterations": n}), tmp_path, threads=1), weights_only=False)
+        for n in (1, 2)
+    )
+    actor, keep = second["ppo"]["actor_state_dict"], SPEC.ppo.average
+    assert set(second["average"]) == {name for name in actor if not name.startswith("obs_normalizer")}
+    for name, value in second["average"].items():
+        torch.testing.assert_close(value, keep * first["average"][name] + (1 - keep) * actor[name])
+    second["average"] = {name: torch.zeros_like(value) for name, value in second["average"].items()}
+    torch.save(second, tmp_path / "policy.pt")
+    assert (load_policy(tmp_path / "policy.pt")[1](torch.rand(3, len(MIRROR[0]))) == 0).all()
+
+
 class _Glide:
     """A body that follows a command exactly, or not at all."""
 
