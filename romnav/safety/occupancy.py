@@ -101,84 +101,49 @@ def _grow(
                 tail += 1
 
 
-# A remembered return: calls since it was seen, then its height and its place in 2^-16 of the grid's side, so that of
-# two in one cell the least number is the youngest.
+# A remembered return: calls since it was seen, then its place in 2^-16 of the grid's side, so that of two in one
+# cell the least number is the youngest.
 _NOTHING = 2**62
 _SHARE = wp.constant(65536.0)
-_LOWEST = wp.constant(-8.0)
-_HEIGHTS = wp.constant(16.0)
 
 
 @wp.func
-def _quantise(x: float, least: float, span: float):
-    return wp.int64(wp.clamp((x - least) / span * _SHARE, 0.0, _SHARE - 1.0))
-
-
-@wp.func
-def _restore(number: wp.int64, least: float, span: float):
-    return (float(number & wp.int64(65535)) + 0.5) / _SHARE * span + least
-
-
-@wp.func
-def _remember(
-    p: wp.vec3,
-    age: wp.int64,
-    ground: wp.array3d(dtype=float),
-    half: float,
-    cell: float,
-    step: float,
-    height: float,
-    b: int,
-    memory: wp.array3d(dtype=wp.int64),
-):
-    """Keep a return if it is on the grid and off the ground, lower than the robot's height."""
-    i = int(wp.floor((p[0] + half) / cell))
-    j = int(wp.floor((p[1] + half) / cell))
+def _remember(x: float, y: float, age: wp.int64, half: float, cell: float, b: int, memory: wp.array3d(dtype=wp.int64)):
+    i = int(wp.floor((x + half) / cell))
+    j = int(wp.floor((y + half) / cell))
     if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
         return
-    above = p[2] - ground[b, i // _GROUND_CELLS, j // _GROUND_CELLS]
-    if above <= step or above > height:
-        return
-    u = _quantise(p[0], -half, 2.0 * half)
-    v = _quantise(p[1], -half, 2.0 * half)
-    w = _quantise(p[2], _LOWEST, _HEIGHTS)
-    packed = (age << wp.int64(48)) | (w << wp.int64(32)) | (u << wp.int64(16)) | v
-    wp.atomic_min(memory, b, i, j, packed)
+    u = wp.int64(wp.clamp((x + half) / (2.0 * half) * _SHARE, 0.0, _SHARE - 1.0))
+    v = wp.int64(wp.clamp((y + half) / (2.0 * half) * _SHARE, 0.0, _SHARE - 1.0))
+    wp.atomic_min(memory, b, i, j, (age << wp.int64(32)) | (u << wp.int64(16)) | v)
 
 
 @wp.kernel(enable_backward=False)
 def _recall(
     before: wp.array3d(dtype=wp.int64),
-    motion: wp.array(dtype=wp.vec4),
-    ground: wp.array3d(dtype=float),
+    motion: wp.array(dtype=wp.vec3),
     half: float,
     cell: float,
-    step: float,
-    height: float,
     calls: wp.int64,
     blind: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
-    """Carry remembered returns into the frame of a robot that has moved, one call older unless it is blind there.
-
-    They are held against the ground as it is seen now: the edge of a landing is an obstacle from below alone.
-    """
+    """Carry remembered returns into the frame of a robot that has moved, one call older unless it is blind there."""
     b, i, j = wp.tid()
     packed = before[b, i, j]
-    age = packed >> wp.int64(48)
-    moved = motion[b]
-    if age >= calls or not wp.isfinite(moved):
+    age = packed >> wp.int64(32)
+    if age >= calls or not wp.isfinite(motion[b]):
         return
-    x = _restore(packed >> wp.int64(16), -half, 2.0 * half) - moved[0]
-    y = _restore(packed, -half, 2.0 * half) - moved[1]
-    z = _restore(packed >> wp.int64(32), _LOWEST, _HEIGHTS) - moved[2]
+    side = 2.0 * half
+    x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
+    y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
     if x * x + y * y > blind * blind:
         age += wp.int64(1)
         if age >= calls:
             return
-    c = wp.cos(moved[3])
-    s = wp.sin(moved[3])
-    _remember(wp.vec3(c * x + s * y, c * y - s * x, z), age, ground, half, cell, step, height, b, memory)
+    c = wp.cos(motion[b][2])
+    s = wp.sin(motion[b][2])
+    _remember(c * x + s * y, c * y - s * x, age, half, cell, b, memory)
 
 
 @wp.kernel(enable_backward=False)
@@ -194,8 +159,15 @@ def _mark(
 ):
     b, k = wp.tid()
     p = points[b, k]
-    if valid[b, k] and wp.isfinite(p):
-        _remember(p, wp.int64(0), ground, half, cell, step, height, b, memory)
+    if not valid[b, k] or not wp.isfinite(p):
+        return
+    i = int(wp.floor((p[0] + half) / cell))
+    j = int(wp.floor((p[1] + half) / cell))
+    if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
+        return
+    above = p[2] - ground[b, i // _GROUND_CELLS, j // _GROUND_CELLS]
+    if above > step and above <= height:
+        _remember(p[0], p[1], wp.int64(0), half, cell, b, memory)
 
 
 @wp.kernel(enable_backward=False)
@@ -337,11 +309,11 @@ class Rasterizer:
             points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the
                 ground beneath the robot's centre.
             valid: (B, N) bool, which returns to use (padding is invalid); all by default.
-            motion: (B, 4) how the robots have moved, m (z, too), and turned, rad, since the last call, in their
-                frame of then. Without it, or where it is not finite, what was seen before is forgotten.
+            motion: (B, 3) how the robots have moved and turned since the last call, in their frame of then, m, m, rad.
+                Without it, or where it is not finite, what was seen before is forgotten.
         """
-        if motion is not None and motion.shape != (self._robots, 4):
-            raise RomnavError(f"motion has shape {tuple(motion.shape)}; expected ({self._robots}, 4)")
+        if motion is not None and motion.shape != (self._robots, 3):
+            raise RomnavError(f"motion has shape {tuple(motion.shape)}; expected ({self._robots}, 3)")
         if points.ndim != 3 or len(points) != self._robots or points.shape[2] != 3:
             raise RomnavError(f"points have shape {tuple(points.shape)}; expected ({self._robots}, N, 3)")
         spec, device = self.spec, self._device
@@ -379,12 +351,9 @@ class Rasterizer:
                 dim=before.shape,
                 inputs=[
                     wp.from_torch(before),
-                    wp.from_torch(motion.float().contiguous(), dtype=wp.vec4),
-                    surface,
+                    wp.from_torch(motion.float().contiguous(), dtype=wp.vec3),
                     half,
                     spec.cell,
-                    spec.step,
-                    spec.height,
                     spec.memory,
                     spec.blind,
                 ],
