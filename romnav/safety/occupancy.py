@@ -8,7 +8,7 @@ an obstacle if it lies more than a step above the ground of its cell and lower t
 
 What has left the field of view is remembered if the caller tells how the robot has moved: one return of each cell,
 carried along at its own place rather than its cell's, so that nothing is rounded twice. It is forgotten after a while,
-but not so near to the robot that the sensor could not see it again.
+but not while the robot stands so near to it that the sensor cannot see it again.
 """
 
 from __future__ import annotations
@@ -126,9 +126,10 @@ def _recall(
     cell: float,
     calls: wp.int64,
     blind: float,
+    still: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
-    """Carry remembered returns into the frame of a robot that has moved, one call older unless it is blind there."""
+    """Carry remembered returns into the frame of a robot that has moved, a call older unless it stands before them."""
     b, i, j = wp.tid()
     packed = before[b, i, j]
     age = packed >> wp.int64(32)
@@ -137,7 +138,8 @@ def _recall(
     side = 2.0 * half
     x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
     y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
-    if x * x + y * y > blind * blind:
+    moved = wp.length(wp.vec2(motion[b][0], motion[b][1]))
+    if moved > still or wp.length(wp.vec2(x, y)) > blind:
         age += wp.int64(1)
         if age >= calls:
             return
@@ -356,6 +358,7 @@ class Rasterizer:
                     spec.cell,
                     spec.memory,
                     spec.blind,
+                    spec.still,
                 ],
                 outputs=[memory],
                 device=device,
