@@ -7,8 +7,8 @@ not ground in that sense (a table top, the storey below a railing) inherits the 
 an obstacle if it lies more than a step above the ground of its cell and lower than the robot's height.
 
 What has left the field of view is remembered if the caller tells how the robot has moved: one return of each cell,
-carried along at its own place rather than its cell's, so that nothing is rounded twice. It is forgotten after a while,
-but not while the robot stands so near to it that the sensor cannot see it again.
+carried along at its own place rather than its cell's, so that nothing is rounded twice. It is forgotten after a while;
+where it is so near to the robot that the sensor cannot see it again, not by time but by the way that the robot goes.
 """
 
 from __future__ import annotations
@@ -101,10 +101,11 @@ def _grow(
                 tail += 1
 
 
-# A remembered return: calls since it was seen, then its place in 2^-16 of the grid's side, so that of two in one
+# A remembered return: its age in 2^-10 calls, then its place in 2^-16 of the grid's side, so that of two in one
 # cell the least number is the youngest.
 _NOTHING = 2**62
 _SHARE = wp.constant(65536.0)
+_TICKS = wp.constant(1024.0)
 
 
 @wp.func
@@ -124,28 +125,27 @@ def _recall(
     motion: wp.array(dtype=wp.vec3),
     half: float,
     cell: float,
-    calls: wp.int64,
+    calls: float,
     blind: float,
-    still: float,
+    travel: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
-    """Carry remembered returns into the frame of a robot that has moved, a call older unless it stands before them."""
+    """Carry remembered returns into the frame of a robot that has moved, older by a call, or nearby by the way."""
     b, i, j = wp.tid()
     packed = before[b, i, j]
-    age = packed >> wp.int64(32)
+    age = float(packed >> wp.int64(32)) / _TICKS
     if age >= calls or not wp.isfinite(motion[b]):
         return
     side = 2.0 * half
     x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
     y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
-    moved = wp.length(wp.vec2(motion[b][0], motion[b][1]))
-    if moved > still or wp.length(wp.vec2(x, y)) > blind:
-        age += wp.int64(1)
-        if age >= calls:
-            return
+    way = wp.length(wp.vec2(motion[b][0], motion[b][1]))
+    age += wp.where(wp.length(wp.vec2(x, y)) <= blind, calls * way / travel, 1.0)
+    if age >= calls:
+        return
     c = wp.cos(motion[b][2])
     s = wp.sin(motion[b][2])
-    _remember(c * x + s * y, c * y - s * x, age, half, cell, b, memory)
+    _remember(c * x + s * y, c * y - s * x, wp.int64(wp.round(age * _TICKS)), half, cell, b, memory)
 
 
 @wp.kernel(enable_backward=False)
@@ -356,9 +356,9 @@ class Rasterizer:
                     wp.from_torch(motion.float().contiguous(), dtype=wp.vec3),
                     half,
                     spec.cell,
-                    spec.memory,
+                    float(spec.memory),
                     spec.blind,
-                    spec.still,
+                    spec.travel,
                 ],
                 outputs=[memory],
                 device=device,

@@ -30,11 +30,11 @@ class OccupancySpec(Config):
     """Calls for which a return is remembered where the robot's motion is told (A: 5 s; 1 remembers nothing, as the
     paper, which mentions no memory)."""
     blind: float = Field(0.7, ge=0)
-    """Distance within which a remembered return does not age while the robot stands, m (A: the mounted LiDAR loses what
-    is 0.3 m high at 0.68 m; a robot held in front of a bench would walk into it once it were forgotten)."""
-    still: float = Field(0.03, ge=0)
-    """A robot stands that moves no further than that in a call, m (A: 0.15 m/s; one that walks on a stair has to forget
-    what it took for a ledge from below)."""
+    """Distance within which a remembered return ages by the robot's way in place of time, m (A: the mounted LiDAR loses
+    what is 0.3 m high at 0.68 m; a robot held in front of a bench would walk into it once it were forgotten)."""
+    travel: float = Field(1.5, gt=0)
+    """Way after which it is then forgotten, m (A: twice `blind`; not more, since what was a ledge from below is in the
+    way of a robot that has climbed the stair)."""
 
 
 class PoissonSpec(Config):

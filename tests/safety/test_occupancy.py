@@ -173,8 +173,8 @@ def test_what_was_seen_is_remembered_at_its_own_place():
     rasterizer = Rasterizer(2, spec)
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
     pose = np.zeros(3)
-    age = np.full(7, 99)
-    for call in range(16):
+    age = np.full(7, 99.0)
+    for call in range(19):
         before = pose
         if call:
             c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -182,7 +182,7 @@ def test_what_was_seen_is_remembered_at_its_own_place():
         c, s = np.cos(pose[2]), np.sin(pose[2])
         local = (poles - pose[:2]) @ np.array([[c, -s], [s, c]])
         points = floor[None].repeat(2, 1, 1)
-        age += 1
+        age += np.where(np.hypot(*local.T) > spec.blind, 1.0, 12 * 0.07 / spec.travel)
         if call == 2:  # seen once, by the first robot alone
             age[:] = 0
             seen = torch.from_numpy(np.column_stack([local, np.full(7, 0.8)])).float()
@@ -221,12 +221,14 @@ def test_what_is_below_the_sensors_view_is_not_forgotten_while_the_robot_stands_
 
 
 def test_a_robot_that_walks_forgets_what_is_near_as_well():
-    rasterizer = Rasterizer(1, OccupancySpec(memory=5))
+    spec = OccupancySpec(travel=0.42)
+    rasterizer = Rasterizer(1, spec)
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()[None]
-    rasterizer(torch.cat([floor, torch.tensor([[[0.12, 0.32, 0.4]]])], dim=1))
-    for call in range(1, 6):
-        occupied = rasterizer(floor, motion=torch.tensor([[0.05, 0.0, 0.0]])).occupied[0]
-        assert occupied.any() == (call < 5)
+    rasterizer(torch.cat([floor, torch.tensor([[[0.22, 0.32, 0.4]]])], dim=1))
+    for call in range(1, 60):
+        motion = torch.tensor([[0.0 if call % 4 else 0.04, 0.0, 0.0]])
+        occupied = rasterizer(floor, motion=motion).occupied[0]
+        assert occupied.any() == (0.04 * (call // 4) < spec.travel)
 
 
 def test_without_motion_nothing_is_remembered():
