@@ -72,12 +72,15 @@ class GaitSpec(Config):
     """Fastest change of the command that the reference follows, m/s^2, m/s^2, rad/s^2."""
     integral_gain: float = 1.0
     """Of the velocity error into the orbit's velocity, 1/s."""
-    integral_limit: float = 0.3
+    integral_limit: float = 0.5
     """Largest correction of the orbit's velocity, m/s."""
-    integral_level: float = 0.03
-    """The error is integrated while the next foothold is not further above or below the feet, m."""
+    level: float = 0.05
+    """Ground is level while neither the feet nor the next foothold are further above each other, m: the velocity's
+    error is integrated there."""
     integral_decay: float = 0.5
     """Time in which the integral decays elsewhere, s."""
+    stair_speed: float = 0.1
+    """Added to a forward velocity that is larger, where the ground is not level, m/s."""
     pull: float = 0.6
     """Shift of the wanted pelvis per metre of error in the divergent component, -: the stance foot's part."""
     early: float = 0.05

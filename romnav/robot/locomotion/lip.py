@@ -70,6 +70,12 @@ def integrate(integral: Tensor, error: Tensor, level: Tensor, spec: GaitSpec, dt
     return (integral + dt * change).clamp(-spec.integral_limit, spec.integral_limit)
 
 
+def orbit_velocity(command: Tensor, integral: Tensor, level: Tensor, spec: GaitSpec) -> Tensor:
+    """Velocity (n, 2) of the orbit for a commanded one (n, 2): corrected, and a little faster up and down stairs."""
+    faster = spec.stair_speed * (~level & (command[:, 0] > spec.stair_speed))
+    return command + integral + torch.stack([faster, torch.zeros_like(faster)], dim=1)
+
+
 def smoothstep(t: Tensor) -> Tensor:
     """Minimum-jerk rise from 0 to 1 over t in [0, 1], clamped."""
     t = t.clamp(0.0, 1.0)
@@ -218,12 +224,6 @@ class Walker:
         start = (tick == 0) | fresh
 
         yaw = torch.atan2(robots.orientation[:, 1, 0], robots.orientation[:, 0, 0])
-        # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
-        # but not on stairs, where treads bound the steps and the integral would wind up.
-        error = self.command[:, :2] - turn_xy(robots.com_velocity[:, :2], -yaw)
-        level = ((self.foothold[:, 2] - self.base).abs() < s.integral_level) | fresh
-        self.integral = integrate(self.integral, error, level, s, self.dt)
-        speed = self.command[:, :2] + self.integral
         lead = wrap(self.heading + turn * self.dt - yaw).clamp(-0.35, 0.35)
         self.heading = wrap(yaw + lead)
         sole = self.soles(robots)
@@ -240,6 +240,15 @@ class Walker:
         mean = under.mean(1)
         self.base = torch.where(start, mean, self.base)
         self.lift = torch.where(start[:, None], swinging, self.lift)
+
+        # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
+        # but not on stairs, where treads bound the steps and the integral would wind up. There, who loses its speed
+        # steps back down to regain it, and falls: it aims at a little more.
+        error = self.command[:, :2] - turn_xy(robots.com_velocity[:, :2], -yaw)
+        apart = torch.maximum((self.foothold[:, 2] - self.base).abs(), (under[:, 0] - under[:, 1]).abs())
+        level = (apart < s.level) | fresh
+        self.integral = integrate(self.integral, error, level, s, self.dt)
+        speed = orbit_velocity(self.command[:, :2], self.integral, level, s)
 
         # Foothold: the divergent component at touch-down, less the periodic gait's offset, within reach.
         left = (1.0 - phase) * self.duration - s.early

@@ -20,6 +20,7 @@ from romnav.robot.locomotion.lip import (
     frequency,
     integrate,
     orbit,
+    orbit_velocity,
     smoothstep,
     turn_xy,
     wrap,
@@ -111,6 +112,15 @@ def test_the_integral_is_bounded_and_forgotten_on_stairs() -> None:
     for _ in range(25):
         full = integrate(full, error, torch.tensor([False]), spec, spec.integral_decay / 25)
     assert full[0, 0].item() == pytest.approx(spec.integral_limit * np.exp(-1), rel=0.03)
+
+
+def test_stairs_are_walked_a_little_faster_than_told_but_only_forwards() -> None:
+    command = torch.tensor([[0.5, 0.1], [0.5, 0.1], [0.05, 0.0], [-0.4, 0.0]])
+    integral = torch.tensor([[0.02, -0.01]]).expand(4, 2)
+    spec = GaitSpec(stair_speed=0.1)
+    speed = orbit_velocity(command, integral, torch.tensor([True, False, False, False]), spec)
+    expected = torch.tensor([[0.52, 0.09], [0.62, 0.09], [0.07, -0.01], [-0.38, -0.01]])
+    torch.testing.assert_close(speed, expected)
 
 
 @pytest.fixture(scope="module")
