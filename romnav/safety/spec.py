@@ -35,8 +35,8 @@ class OccupancySpec(Config):
     still: float = Field(0.03, ge=0)
     """Motion in a call that counts as none, m (A: 0.15 m/s; a robot that presses against the boundary trembles)."""
     travel: float = Field(3.0, gt=0)
-    """Way after which what is near is forgotten, m (A: some 4 s of walking; not more, since what was a ledge from below is
-    in the way of a robot that has climbed the stair)."""
+    """Way after which what is near is forgotten, m (A: some 4 s of walking; not more, since what was a ledge from below
+    is in the way of a robot that has climbed the stair)."""
 
 
 class PoissonSpec(Config):
