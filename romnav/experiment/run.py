@@ -103,6 +103,7 @@ def execute(
     Raises:
         RomnavError: A stage cannot do or write what it should.
     """
+    store.provenance()  # looks up the commit now: another may be checked out before a long stage ends
     for stage in stages:
         changed = "; ".join(store.differences(stage))
         say(f"{stage.name} (changed: {changed})" if changed else stage.name)

@@ -127,6 +127,7 @@ def _recall(
     cell: float,
     calls: float,
     blind: float,
+    still: float,
     travel: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
@@ -140,7 +141,8 @@ def _recall(
     x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
     y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
     way = wp.length(wp.vec2(motion[b][0], motion[b][1]))
-    age += wp.where(wp.length(wp.vec2(x, y)) <= blind, calls * way / travel, 1.0)
+    nearby = wp.where(way > still, calls * way / travel, 0.0)
+    age += wp.where(wp.length(wp.vec2(x, y)) <= blind, nearby, 1.0)
     if age >= calls:
         return
     c = wp.cos(motion[b][2])
@@ -358,6 +360,7 @@ class Rasterizer:
                     spec.cell,
                     float(spec.memory),
                     spec.blind,
+                    spec.still,
                     spec.travel,
                 ],
                 outputs=[memory],

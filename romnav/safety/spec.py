@@ -32,9 +32,11 @@ class OccupancySpec(Config):
     blind: float = Field(0.7, ge=0)
     """Distance within which a remembered return ages by the robot's way in place of time, m (A: the mounted LiDAR loses
     what is 0.3 m high at 0.68 m; a robot held in front of a bench would walk into it once it were forgotten)."""
-    travel: float = Field(1.5, gt=0)
-    """Way after which it is then forgotten, m (A: twice `blind`; not more, since what was a ledge from below is in the
-    way of a robot that has climbed the stair)."""
+    still: float = Field(0.03, ge=0)
+    """Motion in a call that counts as none, m (A: 0.15 m/s; a robot that presses against the boundary trembles)."""
+    travel: float = Field(3.0, gt=0)
+    """Way after which what is near is forgotten, m (A: some 4 s of walking; not more, since what was a ledge from below
+    is in the way of a robot that has climbed the stair)."""
 
 
 class PoissonSpec(Config):

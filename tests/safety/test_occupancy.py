@@ -169,7 +169,7 @@ def test_inflation_is_the_exact_disc(shape, share, radius, seed):
 def test_what_was_seen_is_remembered_at_its_own_place():
     rng = np.random.default_rng(3)
     poles = rng.uniform(-2.0, 2.0, (7, 2))
-    spec = OccupancySpec(memory=12)
+    spec = OccupancySpec(memory=12, travel=1.5)
     rasterizer = Rasterizer(2, spec)
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
     pose = np.zeros(3)
@@ -226,7 +226,7 @@ def test_a_robot_that_walks_forgets_what_is_near_as_well():
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()[None]
     rasterizer(torch.cat([floor, torch.tensor([[[0.22, 0.32, 0.4]]])], dim=1))
     for call in range(1, 60):
-        motion = torch.tensor([[0.0 if call % 4 else 0.04, 0.0, 0.0]])
+        motion = torch.tensor([[0.04 if call % 4 == 0 else 0.02 * (-1) ** call, 0.0, 0.0]])  # walks or trembles
         occupied = rasterizer(floor, motion=motion).occupied[0]
         assert occupied.any() == (0.04 * (call // 4) < spec.travel)
 
