@@ -130,7 +130,7 @@ class Shield:
         self._corruption = Corruption(spec.corruption, spec.seed, device)
         self._filter = SafetyFilter(robots, spec.filter.model_copy(update={"filter": barrier}), device)
         self._mount = torch.tensor([0.0, 0.0, spec.sensor.height], device=device)
-        self._pose = torch.full((robots, 3), torch.nan, device=device)
+        self._pose = torch.full((robots, 4), torch.nan, device=device)
 
     def __call__(
         self, tile: Tensor, position: Tensor, yaw: Tensor, velocity: Tensor, noise: Tensor, step: int
@@ -139,9 +139,9 @@ class Shield:
         ranges = self._lidar.scan(tile.to(torch.int32), position + self._mount, yaw)
         ranges = self._corruption(ranges, noise, torch.full_like(noise, step))
         points = ranges[..., None] * self._lidar.directions + self._mount
-        pose = torch.cat([position[:, :2], yaw[:, None]], dim=1)
+        pose = torch.cat([position, yaw[:, None]], dim=1)
         moved = pose - self._pose
-        motion = torch.cat([rotate(moved[:, :2], self._pose[:, 2]), moved[:, 2:]], dim=1)
+        motion = torch.cat([rotate(moved[:, :2], self._pose[:, 3]), moved[:, 2:]], dim=1)
         self._pose = pose
         return self._filter(points.flatten(1, 2), velocity, (ranges > 0).flatten(1), motion)
 

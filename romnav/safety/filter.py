@@ -452,8 +452,8 @@ class SafetyFilter:
                 ground beneath the robot's centre.
             velocity: (B, 2) desired (vx, vy) in that frame, m/s. The yaw rate passes the filter by.
             valid: (B, N) bool, which returns to use; all by default.
-            motion: (B, 3) how the robots have moved (m) and turned (rad) since the last call, in their frame of then:
-                what has left the field of view is then remembered for a while, else forgotten.
+            motion: (B, 4) how the robots have moved (x, y, z) and turned since the last call, in their frame of
+                then, m and rad: what has left the field of view is then remembered for a while, else forgotten.
         """
         if velocity.shape != (self._robots, 2):
             raise RomnavError(f"velocity has shape {tuple(velocity.shape)}; expected ({self._robots}, 2)")

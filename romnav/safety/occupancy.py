@@ -101,53 +101,77 @@ def _grow(
                 tail += 1
 
 
-# A remembered return: its age in 2^-10 calls, then its place in 2^-16 of the grid's side, so that of two in one
-# cell the least number is the youngest.
+# A remembered return: its age in sixteenths of a call (18 bits), how far it lies below `_TOP` (12), and its place (16
+# each) as shares of the grid's side. Of two in one cell the least number is the youngest, then the highest.
 _NOTHING = 2**62
+_TICKS = wp.constant(16.0)
+_TOP = wp.constant(8.0)
+_HEIGHTS = wp.constant(16.0)
+_DEPTH = wp.constant(4096.0)
 _SHARE = wp.constant(65536.0)
-_TICKS = wp.constant(1024.0)
 
 
 @wp.func
-def _remember(x: float, y: float, age: wp.int64, half: float, cell: float, b: int, memory: wp.array3d(dtype=wp.int64)):
-    i = int(wp.floor((x + half) / cell))
-    j = int(wp.floor((y + half) / cell))
+def _pack(value: float, span: float, levels: float):
+    """Number of the level of a value in [0, span], clamped."""
+    return wp.int64(wp.clamp(value / span * levels, 0.0, levels - 1.0))
+
+
+@wp.func
+def _unpack(packed: wp.int64, shift: int, span: float, levels: float):
+    """The middle of the level whose number starts at bit ``shift``."""
+    number = (packed >> wp.int64(shift)) & wp.int64(int(levels) - 1)
+    return (float(number) + 0.5) / levels * span
+
+
+@wp.func
+def _remember(p: wp.vec3, age: wp.int64, half: float, cell: float, b: int, memory: wp.array3d(dtype=wp.int64)):
+    i = int(wp.floor((p[0] + half) / cell))
+    j = int(wp.floor((p[1] + half) / cell))
     if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
         return
-    u = wp.int64(wp.clamp((x + half) / (2.0 * half) * _SHARE, 0.0, _SHARE - 1.0))
-    v = wp.int64(wp.clamp((y + half) / (2.0 * half) * _SHARE, 0.0, _SHARE - 1.0))
-    wp.atomic_min(memory, b, i, j, (age << wp.int64(32)) | (u << wp.int64(16)) | v)
+    depth = _pack(_TOP - p[2], _HEIGHTS, _DEPTH)
+    u = _pack(p[0] + half, 2.0 * half, _SHARE)
+    v = _pack(p[1] + half, 2.0 * half, _SHARE)
+    packed = (age << wp.int64(44)) | (depth << wp.int64(32)) | (u << wp.int64(16)) | v
+    wp.atomic_min(memory, b, i, j, packed)
 
 
 @wp.kernel(enable_backward=False)
 def _recall(
     before: wp.array3d(dtype=wp.int64),
-    motion: wp.array(dtype=wp.vec3),
+    motion: wp.array(dtype=wp.vec4),
     half: float,
     cell: float,
+    step: float,
     calls: float,
     blind: float,
     still: float,
     travel: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
-    """Carry remembered returns into the frame of a robot that has moved, older by a call, or nearby by the way."""
+    """Carry remembered returns into the frame of a robot that has moved, older by a call, or nearby by the way.
+
+    What is no higher than a step above the robot's feet is forgotten: a landing's edge is a ledge from below alone.
+    """
     b, i, j = wp.tid()
     packed = before[b, i, j]
-    age = float(packed >> wp.int64(32)) / _TICKS
-    if age >= calls or not wp.isfinite(motion[b]):
+    age = float(packed >> wp.int64(44)) / _TICKS
+    moved = motion[b]
+    if age >= calls or not wp.isfinite(moved):
         return
-    side = 2.0 * half
-    x = (float((packed >> wp.int64(16)) & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][0]
-    y = (float(packed & wp.int64(65535)) + 0.5) / _SHARE * side - half - motion[b][1]
-    way = wp.length(wp.vec2(motion[b][0], motion[b][1]))
+    x = _unpack(packed, 16, 2.0 * half, _SHARE) - half - moved[0]
+    y = _unpack(packed, 0, 2.0 * half, _SHARE) - half - moved[1]
+    z = _TOP - _unpack(packed, 32, _HEIGHTS, _DEPTH) - moved[2]
+    way = wp.length(wp.vec2(moved[0], moved[1]))
     nearby = wp.where(way > still, calls * way / travel, 0.0)
     age += wp.where(wp.length(wp.vec2(x, y)) <= blind, nearby, 1.0)
-    if age >= calls:
+    if age >= calls or z <= step:
         return
-    c = wp.cos(motion[b][2])
-    s = wp.sin(motion[b][2])
-    _remember(c * x + s * y, c * y - s * x, wp.int64(wp.round(age * _TICKS)), half, cell, b, memory)
+    c = wp.cos(moved[3])
+    s = wp.sin(moved[3])
+    p = wp.vec3(c * x + s * y, c * y - s * x, z)
+    _remember(p, wp.int64(wp.round(age * _TICKS)), half, cell, b, memory)
 
 
 @wp.kernel(enable_backward=False)
@@ -171,7 +195,7 @@ def _mark(
         return
     above = p[2] - ground[b, i // _GROUND_CELLS, j // _GROUND_CELLS]
     if above > step and above <= height:
-        _remember(p[0], p[1], wp.int64(0), half, cell, b, memory)
+        _remember(p, wp.int64(0), half, cell, b, memory)
 
 
 @wp.kernel(enable_backward=False)
@@ -313,11 +337,11 @@ class Rasterizer:
             points: (B, N, 3) returns in the gravity-aligned robot frame, m: x ahead, z up, the origin on the
                 ground beneath the robot's centre.
             valid: (B, N) bool, which returns to use (padding is invalid); all by default.
-            motion: (B, 3) how the robots have moved and turned since the last call, in their frame of then, m, m, rad.
-                Without it, or where it is not finite, what was seen before is forgotten.
+            motion: (B, 4) how the robots have moved (x, y, z) and turned since the last call, in their frame of
+                then, m and rad. Without it, or where it is not finite, what was seen before is forgotten.
         """
-        if motion is not None and motion.shape != (self._robots, 3):
-            raise RomnavError(f"motion has shape {tuple(motion.shape)}; expected ({self._robots}, 3)")
+        if motion is not None and motion.shape != (self._robots, 4):
+            raise RomnavError(f"motion has shape {tuple(motion.shape)}; expected ({self._robots}, 4)")
         if points.ndim != 3 or len(points) != self._robots or points.shape[2] != 3:
             raise RomnavError(f"points have shape {tuple(points.shape)}; expected ({self._robots}, N, 3)")
         spec, device = self.spec, self._device
@@ -355,9 +379,10 @@ class Rasterizer:
                 dim=before.shape,
                 inputs=[
                     wp.from_torch(before),
-                    wp.from_torch(motion.float().contiguous(), dtype=wp.vec3),
+                    wp.from_torch(motion.float().contiguous(), dtype=wp.vec4),
                     half,
                     spec.cell,
+                    spec.step,
                     float(spec.memory),
                     spec.blind,
                     spec.still,

@@ -26,7 +26,7 @@ class OccupancySpec(Config):
     """Steepest rise per metre across ground that was not seen (A: the steepest stair, 0.18 / 0.26)."""
     height: float = Field(1.4, gt=0)
     """Height above the ground from which the robot passes beneath a return, m (A: the G1 stands 1.32 m)."""
-    memory: int = Field(25, ge=1, lt=2**15)
+    memory: int = Field(25, ge=1, lt=2**14)
     """Calls for which a return is remembered where the robot's motion is told (A: 5 s; 1 remembers nothing, as the
     paper, which mentions no memory)."""
     blind: float = Field(0.7, ge=0)

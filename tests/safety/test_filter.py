@@ -344,7 +344,7 @@ def test_selected_robots_keep_their_past():
     spec = SafetySpec(occupancy=OccupancySpec(size=3.0), poisson=PoissonSpec(sweeps=3, cold_sweeps=30))
     whole, part = SafetyFilter(9, spec), SafetyFilter(9, spec)
     keep = torch.tensor([7, 0, 3, 4, 8, 2])
-    motion = torch.from_numpy(rng.uniform(-0.1, 0.1, (9, 3))).float()
+    motion = torch.from_numpy(rng.uniform(-0.1, 0.1, (9, 4))).float()
     for safe in (whole, part):
         safe(points, velocity)
     part.select(keep)

@@ -189,7 +189,7 @@ def test_what_was_seen_is_remembered_at_its_own_place():
             points = torch.stack([torch.cat([floor, seen]), torch.cat([floor, floor[:7]])])
         c, s = np.cos(before[2]), np.sin(before[2])
         moved = np.array([[c, s], [-s, c]]) @ (pose - before)[:2]
-        motion = torch.tensor([*moved, pose[2] - before[2]]).float().expand(2, 3)
+        motion = torch.tensor([*moved, 0.0, pose[2] - before[2]]).float().expand(2, 4)
         occupied = rasterizer(points, motion=motion).occupied
         assert not occupied[1].any()
         expected = np.zeros((120, 120), bool)
@@ -209,7 +209,7 @@ def test_what_is_below_the_sensors_view_is_not_forgotten_while_the_robot_stands_
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()[None]
     near, far = torch.tensor([[0.5, 0.0, 0.4], [1.5, 0.0, 0.4]])
     rasterizer(torch.cat([floor, near[None, None], far[None, None]], dim=1))
-    still, back = torch.zeros(1, 3), torch.tensor([[-0.5, 0.0, 0.0]])
+    still, back = torch.zeros(1, 4), torch.tensor([[-0.5, 0.0, 0.0, 0.0]])
     for call in range(1, 200):
         occupied = rasterizer(floor, motion=still).occupied[0]
         assert occupied[70, 60]
@@ -226,16 +226,30 @@ def test_a_robot_that_walks_forgets_what_is_near_as_well():
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()[None]
     rasterizer(torch.cat([floor, torch.tensor([[[0.22, 0.32, 0.4]]])], dim=1))
     for call in range(1, 60):
-        motion = torch.tensor([[0.04 if call % 4 == 0 else 0.02 * (-1) ** call, 0.0, 0.0]])  # walks or trembles
+        motion = torch.tensor([[0.04 if call % 4 == 0 else 0.02 * (-1) ** call, 0.0, 0.0, 0.0]])  # walks or trembles
         occupied = rasterizer(floor, motion=motion).occupied[0]
         assert occupied.any() == (0.04 * (call // 4) < spec.travel)
+
+
+def test_a_ledge_is_none_any_more_once_climbed():
+    rasterizer = Rasterizer(1, OccupancySpec())
+    floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
+    edge = torch.tensor([[0.52, 0.0, 0.45], [0.52, 0.22, 0.4], [0.52, 0.22, 1.1]])  # of a landing, and a post on it
+    below = rasterizer(torch.cat([floor, edge])[None]).occupied[0]
+    assert below[70, 60]
+    assert below[70, 64]
+    up = torch.tensor([[0.5, 0.0, 0.45, 0.0]])
+    above = rasterizer(floor[None], motion=up).occupied[0]
+    assert above.nonzero().tolist() == [[60, 64]]
+    again = rasterizer(floor[None], motion=-up).occupied[0]
+    assert again.nonzero().tolist() == [[70, 64]]
 
 
 def test_without_motion_nothing_is_remembered():
     rasterizer = Rasterizer(3, OccupancySpec())
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
     pole = torch.cat([floor, torch.tensor([[1.0, 0.2, 0.8]])]).expand(3, -1, -1)
-    still = torch.zeros(3, 3)
+    still = torch.zeros(3, 4)
     still[1] = torch.nan
     assert rasterizer(pole).occupied.flatten(1).any(dim=1).all()
     rasterizer.reset(torch.tensor([False, False, True]))
