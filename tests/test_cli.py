@@ -96,6 +96,7 @@ def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> N
     lines = romnav("list").stdout.splitlines()
     assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == [
         "deploy",
+        "humanoid",
         "pretrain",
         "safety",
         "spawn-goal",
