@@ -28,6 +28,16 @@ _GROUND_CELLS = wp.constant(2)
 _UNSEEN = wp.constant(wp.inf)
 
 
+@wp.func
+def _cell_of(p: wp.vec3, half: float, cell: float):
+    return wp.vec2i(int(wp.floor((p[0] + half) / cell)), int(wp.floor((p[1] + half) / cell)))
+
+
+@wp.func
+def _holds(at: wp.vec2i, rows: int, columns: int):
+    return at[0] >= 0 and at[1] >= 0 and at[0] < rows and at[1] < columns
+
+
 @wp.kernel(enable_backward=False)
 def _lowest(
     points: wp.array2d(dtype=wp.vec3),
@@ -47,10 +57,9 @@ def _lowest(
         wp.atomic_add(broken, b, 1)
         return
     wp.atomic_add(used, b, 1)
-    i = int(wp.floor((p[0] + half) / cell))
-    j = int(wp.floor((p[1] + half) / cell))
-    if i >= 0 and j >= 0 and i < lowest.shape[1] and j < lowest.shape[2]:
-        wp.atomic_min(lowest, b, i, j, p[2])
+    at = _cell_of(p, half, cell)
+    if _holds(at, lowest.shape[1], lowest.shape[2]):
+        wp.atomic_min(lowest, b, at[0], at[1], p[2])
 
 
 @wp.kernel(enable_backward=False)
@@ -126,15 +135,14 @@ def _unpack(packed: wp.int64, shift: int, span: float, levels: float):
 
 @wp.func
 def _remember(p: wp.vec3, age: wp.int64, half: float, cell: float, b: int, memory: wp.array3d(dtype=wp.int64)):
-    i = int(wp.floor((p[0] + half) / cell))
-    j = int(wp.floor((p[1] + half) / cell))
-    if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
+    at = _cell_of(p, half, cell)
+    if not _holds(at, memory.shape[1], memory.shape[2]):
         return
     depth = _pack(_TOP - p[2], _HEIGHTS, _DEPTH)
     u = _pack(p[0] + half, 2.0 * half, _SHARE)
     v = _pack(p[1] + half, 2.0 * half, _SHARE)
     packed = (age << wp.int64(44)) | (depth << wp.int64(32)) | (u << wp.int64(16)) | v
-    wp.atomic_min(memory, b, i, j, packed)
+    wp.atomic_min(memory, b, at[0], at[1], packed)
 
 
 @wp.kernel(enable_backward=False)
@@ -189,11 +197,10 @@ def _mark(
     p = points[b, k]
     if not valid[b, k] or not wp.isfinite(p):
         return
-    i = int(wp.floor((p[0] + half) / cell))
-    j = int(wp.floor((p[1] + half) / cell))
-    if i < 0 or j < 0 or i >= memory.shape[1] or j >= memory.shape[2]:
+    at = _cell_of(p, half, cell)
+    if not _holds(at, memory.shape[1], memory.shape[2]):
         return
-    above = p[2] - ground[b, i // _GROUND_CELLS, j // _GROUND_CELLS]
+    above = p[2] - ground[b, at[0] // _GROUND_CELLS, at[1] // _GROUND_CELLS]
     if above > step and above <= height:
         _remember(p, wp.int64(0), half, cell, b, memory)
 
