@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from romnav.navigation.attention import Attend
 from romnav.navigation.spec import PolicySpec
+from romnav.precision import product_dtype, reduced_precision
 from romnav.sensing.encoder import Encoder
 
 LAYERS = 2
@@ -28,11 +29,6 @@ def with_bearing(state: Tensor) -> Tensor:
     """
     bearing = torch.nn.functional.normalize(state[:, :2], dim=1, eps=0.05)
     return torch.cat([state * state.new_tensor(STATE_SCALE), bearing], dim=1)
-
-
-def reduced_precision(like: Tensor) -> torch.autocast:
-    """Context in which dense products are bfloat16: twice as fast and half the memory, here as on a GPU."""
-    return torch.autocast(like.device.type, torch.bfloat16)
 
 
 class GRULayer(torch.autograd.Function):
@@ -191,8 +187,8 @@ class NavigationActor(MLPModel):
         hidden_state: HiddenState = None,
         stochastic_output: bool = False,
     ) -> Tensor:
-        """Actions (..., 3): samples, or means. Products are bfloat16 up to the last layer, weights float32."""
-        with reduced_precision(obs["state"]):
+        """Actions (..., 3): samples or means. Products up to the last layer in `reduced_precision`; weights float32."""
+        with reduced_precision(obs["state"].device):
             latent = self.get_latent(obs, masks, hidden_state)
             features = self.mlp[1](self.mlp[0](latent))
         parameters = self.mlp[3](self.mlp[2](features.float()))
@@ -207,7 +203,7 @@ class NavigationActor(MLPModel):
         lead = obs["state"].shape[:-1]
         state = self.state_embedding(with_bearing(obs["state"].flatten(0, -2)))
         lidar = obs["lidar"].flatten(0, -3)
-        tokens = lidar if self.encoder is None else self.encoder(lidar.float())
+        tokens = lidar.to(product_dtype(lidar.device)) if self.encoder is None else self.encoder(lidar.float())
         seen = torch.cat([self.attention(tokens, state), state], dim=1).unflatten(0, lead)
         if single:
             hidden = self._hidden_for(lead[0], seen)

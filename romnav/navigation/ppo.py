@@ -16,8 +16,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.navigation.env import ACTIONS
-from romnav.navigation.policy import LAYERS, NavigationActor, reduced_precision
+from romnav.navigation.policy import LAYERS, NavigationActor
 from romnav.navigation.spec import PolicySpec, PPOSpec
+from romnav.precision import reduced_precision
 from romnav.sensing.encoder import Encoder
 
 
@@ -63,10 +64,10 @@ class PrivilegedCritic(MLPModel):
         hidden_state: HiddenState = None,
         stochastic_output: bool = False,
     ) -> Tensor:
-        """(..., 1) values; products are bfloat16 up to the last layer."""
+        """(..., 1) values; products up to the last layer are in `reduced_precision`."""
         *hidden, last = self.mlp
         features = self.get_latent(obs)
-        with reduced_precision(features):
+        with reduced_precision(features.device):
             for layer in hidden:
                 features = layer(features)
         return last(features.float())

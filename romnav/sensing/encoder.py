@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from romnav import files
 from romnav.errors import RomnavError
+from romnav.precision import product_dtype, reduced_precision
 from romnav.sensing.spec import EncoderSpec
 from romnav.world.solids import Label
 
@@ -85,10 +86,10 @@ class Encoder(nn.Module):
     def forward(self, ranges: Tensor) -> Tensor:
         """(B, tokens, channels) float32 posterior means of ``ranges`` (B, rows, columns) in m, with gradients.
 
-        Computed in bfloat16 if the spec says so.
+        Computed in bfloat16 if the spec says so and the processor can.
         """
-        image = self.image(ranges, torch.bfloat16 if self.spec.bfloat16 else torch.float32)
-        with torch.autocast(ranges.device.type, torch.bfloat16, enabled=self.spec.bfloat16):
+        image = self.image(ranges, product_dtype(ranges.device) if self.spec.bfloat16 else torch.float32)
+        with reduced_precision(ranges.device, self.spec.bfloat16):
             return self.mean(self.trunk(image)).flatten(2).transpose(1, 2).float()
 
     @torch.no_grad()

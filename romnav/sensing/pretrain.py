@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from romnav import files, random
 from romnav.errors import RomnavError
+from romnav.precision import reduced_precision
 from romnav.progress import Progress
 from romnav.sensing import encoder as checkpoints
 from romnav.sensing.corruption import Corruption
@@ -110,7 +111,7 @@ def loss_terms(
     one that was ``seen`` (both (B, rows, columns)). ``labels`` (B, rows, columns) are `Label`, -1 without a return.
     """
     scale = spec.encoder.scale
-    with torch.autocast(clean.device.type, torch.bfloat16, enabled=spec.encoder.bfloat16):
+    with reduced_precision(clean.device, spec.encoder.bfloat16):
         mean, log_variance = (x.float() for x in model.encoder.posterior(seen))
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         out = model.decoder(mean + (0.5 * log_variance).exp() * noise)

@@ -85,7 +85,7 @@ class EncoderSpec(Config):
     latent: int = 32
     """Channels of a token (A)."""
     bfloat16: bool = True
-    """Compute frozen tokens in bfloat16 (A: twice as fast; its error is far below the latent's own noise)."""
+    """Compute tokens in bfloat16 where the processor can (A: twice as fast, its error far below the latent's noise)."""
 
 
 class PretrainSpec(Config):

@@ -15,10 +15,10 @@ from tensordict import TensorDict
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint, train
 from romnav.navigation.env import STATE_SIZE
-from romnav.navigation.policy import reduced_precision
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.rewards import TERMS
 from romnav.navigation.spec import EncoderUseSpec, EnvSpec, NavigationSpec, PolicySpec, PPOSpec, RewardSpec
+from romnav.precision import reduced_precision
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train as train_locomotion
@@ -169,7 +169,7 @@ def test_a_policy_with_its_own_encoder_carries_and_uses_it(world: World, spec: N
     template = TensorDict({"lidar": torch.zeros(1, *TOKENS), "state": state[:1]}, batch_size=[1])
     frozen = make_actor(template, spec.policy)
     frozen.load_state_dict({k: v for k, v in weights(tmp_path).items() if not k.startswith("encoder.")})
-    with torch.no_grad(), reduced_precision(images):
+    with torch.no_grad(), reduced_precision(images.device):
         seen = {"own": actor.encoder(images.float()), "pretrained": perception.encoder(images.float())}
     obs = {name: TensorDict({"lidar": tokens, "state": state}, batch_size=[5]) for name, tokens in seen.items()}
     torch.testing.assert_close(frozen(obs["own"]), mine)
