@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from romnav.kernels import wp
 from romnav.world.solids import Shape, Solids
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": "-march=native -w"})
 
 PLACE = (2.0, 2.0, 2.0)
 """Size of a place, m: storeys are whole numbers of places apart, and rooms a few wide."""
