@@ -123,13 +123,13 @@ def _find(
             and lo[2] - b[2] <= wp.max(slopes[1] * near, slopes[1] * far)
             and hi[2] - a[2] >= wp.min(slopes[0] * near, slopes[0] * far)
         )
-        n = int(0)
+        n = wp.int32(0)
         while visible and n < screens.shape[0]:
             screen = screens[n]
             n += 1
             axis = screen.axis
-            shortest = float(-1.0)
-            longest = float(0.0)
+            shortest = -1.0
+            longest = 0.0
             if b[axis] < screen.at and lo[axis] > screen.at:
                 shortest = (screen.at - b[axis]) / (hi[axis] - b[axis])
                 longest = (screen.at - a[axis]) / (lo[axis] - a[axis])
@@ -176,7 +176,9 @@ def find(tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float,
         inputs: list[Any] = [wp.array(x, dtype=wp.vec3, device="cpu") for x in (low, high)]
         inputs += [wp.array(screens, dtype=Screen, device="cpu"), wp.array(table, dtype=wp.int32, device="cpu")]
         inputs += [wp.vec3(*corner), wp.vec3i(*count.tolist()), wp.vec3(*size), wp.vec2(*slopes), max_range]
-        wp.launch(_find, len(seen) - 1, [*inputs, wp.array(seen, dtype=wp.uint8, device="cpu", copy=False)], device="cpu")
+        wp.launch(
+            _find, len(seen) - 1, [*inputs, wp.array(seen, dtype=wp.uint8, device="cpu", copy=False)], device="cpu"
+        )
         lists.append((np.nonzero(seen)[1] + offset).astype(np.int32))
         lengths.append(seen.sum(1, dtype=np.int64))
         corners.append(corner)
