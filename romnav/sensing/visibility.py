@@ -218,18 +218,18 @@ def _screens(solids: Solids, low: NDArray, high: NDArray) -> tuple[NDArray, NDAr
     turned = np.abs(np.sin(2 * solids.yaw)) > 1e-9
     whole = (solids.shape == Shape.BOX) & ~turned & (solids.slope_bottom == 0) & (solids.slope_top == 0)
     low, high = low[whole] + 1e-4, high[whole] - 1e-4
-    sheets = []
+    planes = []
     for axis in range(3):
         others = [(axis + 1) % 3, (axis + 2) % 3]
         thin = (high - low).argmin(1) == axis
-        planes = np.unique(np.round((low[thin, axis] + high[thin, axis]) / 2, 3))
-        for at in planes:
+        for at in np.unique(np.round((low[thin, axis] + high[thin, axis]) / 2, 3)):
             cut = (low[:, axis] < at) & (high[:, axis] > at)
-            if cut.any():
-                sheets.append(_sheet(axis, float(at), low[cut][:, others], high[cut][:, others]))
-    sheets = sorted(sheets, key=lambda s: -int(s.covered.sum()))[:MAX_SCREENS]
+            rectangles = low[cut][:, others], high[cut][:, others]
+            planes.append((float((rectangles[1] - rectangles[0]).prod(1).sum()), axis, float(at), *rectangles))
+    planes.sort(key=lambda plane: -plane[0])
+    sheets = [_sheet(*plane[1:]) for plane in planes[:MAX_SCREENS] if plane[0] > 0]
     screens = np.zeros(len(sheets), Screen.numpy_dtype())
-    tables = [np.pad(s.covered.cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32) for s in sheets]
+    tables = [np.pad(s.covered.cumsum(0, np.int32).cumsum(1, np.int32), ((1, 0), (1, 0))) for s in sheets]
     for row, sheet in zip(screens, sheets, strict=True):
         row["axis"], row["at"], (row["u"], row["v"]) = sheet.axis, sheet.at, sheet.corner
         row["columns"], row["rows"] = sheet.covered.shape
@@ -240,11 +240,11 @@ def _screens(solids: Solids, low: NDArray, high: NDArray) -> tuple[NDArray, NDAr
 def _sheet(axis: int, at: float, low: NDArray, high: NDArray) -> _Sheet:
     """Cells of a plane that lie wholly in the union of the rectangles ``low`` (R, 2) to ``high``."""
     lines = [np.unique(np.round(np.concatenate([low[:, k], high[:, k]]), 6)) for k in range(2)]
-    union = np.zeros((len(lines[0]) - 1, len(lines[1]) - 1), np.int64)
+    union = np.zeros((len(lines[0]) - 1, len(lines[1]) - 1), np.int32)
     for a, b in zip(np.round(low, 6), np.round(high, 6), strict=True):
         (u0, u1), (v0, v1) = (np.searchsorted(lines[k], (a[k], b[k])) for k in range(2))
         union[u0:u1, v0:v1] = 1
-    total = np.pad(union.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    total = np.pad(union.cumsum(0, np.int32).cumsum(1, np.int32), ((1, 0), (1, 0)))
     corner = np.array([line[0] for line in lines])
     span = []
     for k, line in enumerate(lines):

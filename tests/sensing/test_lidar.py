@@ -172,6 +172,21 @@ def test_tiles_of_each_class(generated: tuple[list[Solids], tuple[Tensor, Tensor
     assert len(np.unique(labels)) >= 4
 
 
+def test_large_tiles_lose_nothing_to_their_lists() -> None:
+    """A tile of three storeys and one outdoors, 40 m wide, from standing poses and from anywhere."""
+    made = [generate(WorldSpec(side=40.0), i) for i in (0, 1)]
+    solids = [t.solids for t, _ in made]
+    rng = np.random.default_rng(0)
+    standing = np.concatenate([g.position[rng.integers(len(g.position), size=6)] for _, g in made])
+    anywhere = rng.uniform((-3, -3, -1), (43, 43, 14), (12, 3))
+    origin = torch.tensor(np.concatenate([standing + np.array([0, 0, COARSE.height]), anywhere])).float()
+    tile = torch.tensor([0] * 6 + [1] * 6 + [0, 1] * 6, dtype=torch.int32)
+    pose = tile, origin, torch.tensor(rng.uniform(-4, 4, len(tile))).float()
+    lidar = Lidar(solids, COARSE)
+    ranges, labels = lidar.scan(*pose, labels=True)
+    assert_exact(lidar, solids, pose, ranges, labels)
+
+
 def test_mesh_backend_agrees(generated: tuple[list[Solids], tuple[Tensor, Tensor, Tensor]]) -> None:
     solids, pose = generated
     ranges, labels = Lidar(solids, LidarSpec()).scan(*pose, labels=True)

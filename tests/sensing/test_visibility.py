@@ -10,7 +10,7 @@ from romnav.sensing import visibility
 from romnav.sensing.lidar import Lidar
 from romnav.sensing.spec import LidarSpec
 from romnav.world.grids import Grids
-from romnav.world.solids import Solids
+from romnav.world.solids import Label, Solids, SolidsBuilder
 from romnav.world.spec import WorldSpec
 from romnav.world.tiles import generate
 
@@ -63,3 +63,37 @@ def test_places_list_few_solids(tiles: list[tuple[Solids, Grids]]) -> None:
     cell = np.floor((at - places.corner.numpy()[0]) / visibility.PLACE).astype(int)
     index = np.ravel_multi_index(tuple(cell.T), tuple(places.count.numpy()[0]))
     assert length[index].mean() < 0.5 * len(solids)
+
+
+def lists_ball(builder: SolidsBuilder, position: tuple[float, float, float]) -> bool:
+    """Whether a ball at (15, 10), knee-high, is a candidate seen from ``position`` once it joins the solids."""
+    builder.box((10.0, 10.0), (20.0, 20.0), (-0.2, 0.0), label=Label.GROUND, layers=(0, 0))
+    builder.cylinder((15.0, 10.0), 0.2, (0.5, 1.5))
+    solids = builder.build()
+    places = visibility.find([solids], (-2.0, 0.2), 30.0, "cpu")
+    cell = np.floor((np.array(position) - places.corner.numpy()[0]) / visibility.PLACE).astype(int)
+    index = np.ravel_multi_index(tuple(cell), tuple(places.count.numpy()[0]))
+    start = places.start.numpy()
+    return len(solids) - 1 in places.solid.numpy()[start[index] : start[index + 1]]
+
+
+@pytest.mark.parametrize(("gap", "seen"), [(0.0, False), (1.0, True)], ids=["wall", "door"])
+def test_wall_hides_and_door_shows(gap: float, seen: bool) -> None:
+    """Two boxes that touch are one wall."""
+    half = 10.0 - gap / 2
+    for x, through in ((5.0, seen), (17.0, True)):
+        b = SolidsBuilder()
+        b.box((10.0, half / 2), (0.2, half), (0.0, 4.0))
+        b.box((10.0, 20.0 - half / 2), (0.2, half), (0.0, 4.0))
+        assert lists_ball(b, (x, 10.0, 1.3)) == through
+
+
+@pytest.mark.parametrize(("hole", "seen"), [(False, False), (True, True)])
+def test_slab_hides_what_is_below_unless_it_has_a_hole(hole: bool, seen: bool) -> None:
+    b = SolidsBuilder()
+    if hole:
+        b.box((6.5, 10.0), (13.0, 20.0), (3.8, 4.0), label=Label.GROUND, layers=(1, 1))
+        b.box((18.0, 10.0), (4.0, 20.0), (3.8, 4.0), label=Label.GROUND, layers=(1, 1))
+    else:
+        b.box((10.0, 10.0), (20.0, 20.0), (3.8, 4.0), label=Label.GROUND, layers=(1, 1))
+    assert lists_ball(b, (13.0, 10.0, 5.3)) == seen
