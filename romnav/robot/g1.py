@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.resources
 from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
@@ -234,6 +235,7 @@ class Humanoids(Robots):
 
     def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
         super().__init__(spec, ground, count)
+        self._models: list[mujoco.MjModel] = []
         self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
         for field in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             self.batch.bind(field)
@@ -245,6 +247,7 @@ class Humanoids(Robots):
     def stand_on(self, models: list[mujoco.MjModel]) -> None:
         """Give every robot the model it is in from now on, of `build_spec` with as many geoms as this one's."""
         self.batch.set_models(models)
+        self._models = models
 
     def _field(self, name: str) -> Tensor:
         return _single(getattr(self.batch, name))
@@ -287,10 +290,24 @@ class Humanoids(Robots):
     def randomize(self, friction: Tensor, payload: Tensor) -> None:
         """Give every robot its own foot friction (n,) and torso payload (n,), kg."""
         soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in range(6)]
+        if self._models:
+            self.stand_on([
+                self._own(model, soles, float(slip), float(load))
+                for model, slip, load in zip(self._models, friction, payload, strict=True)
+            ])
+            return
         self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
         torso = self.model.body("torso_link").id
         self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
         self.batch.set_const()
+
+    @staticmethod
+    def _own(model: mujoco.MjModel, soles: list[int], friction: float, payload: float) -> mujoco.MjModel:
+        own = copy.copy(model)
+        own.geom_friction[soles, 0] = friction
+        own.body_mass[own.body("torso_link").id] += payload
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        return own
 
     def state_dict(self) -> dict[str, NDArray]:
         """All that decides the future: MuJoCo's integration state and the last contacts."""

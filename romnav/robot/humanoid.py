@@ -16,7 +16,7 @@ from romnav.robot.g1 import Humanoids, build_spec
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
-from romnav.robot.tiles import TileGeoms, TileHeights
+from romnav.robot.tiles import TileGeoms, TileHeights, change_layer
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.world import World
@@ -175,12 +175,7 @@ class Humanoid:
         z = self._heights(xy, reach)
         self.position = torch.cat([xy, z[:, None]], dim=1)
         self.yaw = heading_of(self.robots.orientation)
-        world = self.world
-        up = (z > world.switch[self.tile, self.layer + 1]).long()
-        down = (z <= world.switch[self.tile, self.layer]).long()
-        layer = self.layer + up - down
-        exists = world.surface(self.tile, layer.clamp(0, world.height.shape[1] - 1), xy).isfinite()
-        self.layer = torch.where(exists, layer, self.layer)
+        self.layer = change_layer(self.world, self.tile, self.layer, xy, z)
 
     def select(self, envs: Tensor) -> None:
         """Keep only the robots ``envs`` (K,), in that order."""
