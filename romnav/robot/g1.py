@@ -291,10 +291,12 @@ class Humanoids(Robots):
         """Give every robot its own foot friction (n,) and torso payload (n,), kg."""
         soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in range(6)]
         if self._models:
-            self.stand_on([
-                self._own(model, soles, float(slip), float(load))
-                for model, slip, load in zip(self._models, friction, payload, strict=True)
-            ])
+            self.stand_on(
+                [
+                    self._own(model, soles, float(slip), float(load))
+                    for model, slip, load in zip(self._models, friction, payload, strict=True)
+                ]
+            )
             return
         self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
         torso = self.model.body("torso_link").id

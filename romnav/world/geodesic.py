@@ -617,7 +617,7 @@ class GeodesicLookup:
 
 
 def _nearest_free(node: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(T, L, N, N) node of the free cell nearest to each cell within its layer; where a layer has none, of the tile's."""
+    """(T, L, N, N) nearest free node to each cell within its layer; where a layer has none, any of the tile."""
     out = np.empty_like(node)
     for t in range(len(node)):
         anywhere = node[t].max()

@@ -214,7 +214,7 @@ def tracking_error(
 
 
 class WalkingEnv(VecEnv):
-    """Robots that are to walk as commanded: reward, observation, pushes. Where and under whose commands is a subclass's.
+    """Robots that are to walk as commanded: reward, observation, pushes. Where, and who commands, is a subclass's.
 
     Args:
         spec: of the task.

@@ -1,4 +1,4 @@
-"""The locomotion task as navigation sets it: on tiles of a world, under commands at 5 Hz that know nothing of the gait."""
+"""The locomotion task as navigation sets it: on tiles of a world, commanded at 5 Hz by drivers blind to the gait."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from romnav.robot.locomotion.task import LocomotionEnv, WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.spec import LocomotionSpec, PpoSpec
-from romnav.world.world import World, build
+from romnav.world.world import build
 
 GROUPS = {"actor": ["policy"], "critic": ["policy", "privileged"]}
 
@@ -59,8 +59,8 @@ class Together(VecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides the future of the run."""
-        tiles = {"tiles": part.state_dict() for part in self.parts[1:]}
-        return self.parts[0].state_dict() | tiles
+        lanes, *tiles = (part.state_dict() for part in self.parts)
+        return lanes | {"tiles": tiles[0]} if tiles else lanes
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`; where it knows of no robots on tiles, those begin."""
@@ -284,7 +284,7 @@ def _check_finite(path: Path, iteration: int, row: dict[str, float], ppo: PPO) -
         wrong += [f"{owner} {name}" for name, value in state.items() if not bool(value.isfinite().all())]
     if wrong:
         raise RomnavError(
-            f"{path}: iteration {iteration}: {', '.join(wrong[:3])} not finite; the checkpoint is of an iteration before. "
+            f"{path}: iteration {iteration}: {', '.join(wrong[:3])} not finite; the checkpoint is of one before. "
             "Lower ppo.learning_rate, or look at the settings"
         )
 
