@@ -99,7 +99,12 @@ def _train(
                 obs, reward, dones, extras = env.step(ppo.act(obs))
                 ppo.process_env_step(obs, reward, dones, extras)
             ppo.compute_returns(obs)
-        losses = ppo.update()
+        try:
+            losses = ppo.update()
+        except (RuntimeError, ValueError) as error:
+            # distributions refuse parameters that are not finite, before any loss is reported
+            _check_finite(state, done + 1, {}, ppo)
+            raise error
         done += 1
         seconds = before + time.monotonic() - started
         cpu_seconds = cpu_before + time.process_time() - cpu_started

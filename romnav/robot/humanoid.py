@@ -182,7 +182,7 @@ class Humanoid:
         reach = self.control.walker.soles(self.robots)[..., 2].amin(1) + STEP_UP
         yaw = heading_of(self.robots.orientation)
         # Physics that blew up counts as a fall, where the robot was last.
-        finite = pelvis.isfinite().all(1) & yaw.isfinite() & reach.isfinite()
+        finite = pelvis.isfinite().all(1) & yaw.isfinite() & reach.isfinite() & ~self.robots.lost
         xy = torch.where(finite[:, None], pelvis[:, :2], self.position[:, :2])
         z = torch.where(finite, self._heights(xy, reach), self.position[:, 2])
         self.position = torch.cat([xy, z[:, None]], dim=1)

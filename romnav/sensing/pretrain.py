@@ -210,8 +210,8 @@ class _Training:
         wrong = [name for name, value in zip(TERMS, terms.tolist(), strict=True) if not math.isfinite(value)]
         if wrong:
             raise RomnavError(
-                f"pretraining: step {self.step + 1}: {', '.join(wrong)} of the loss is not finite; what is saved is of a "
-                "step before. Lower learning_rate"
+                f"pretraining: step {self.step + 1}: {', '.join(wrong)} of the loss is not finite; what is saved is "
+                "of a step before. Lower learning_rate"
             )
         self._optimizer.zero_grad()
         terms.sum().backward()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from romnav.evaluation import trials
-from romnav.evaluation.rollout import Oracle, Straight
+from romnav.evaluation.rollout import Oracle, Straight, View
 from romnav.evaluation.spec import TrialSpec
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.body import BodyModel

@@ -523,7 +523,7 @@ class LocomotionEnv(WalkingEnv):
 
 
 def has_fallen(robots: Robots) -> Tensor:
-    """(n,) pelvis less than 0.42 m over the lower foot, or tipped by more than about 55 degrees; or not finite."""
+    """(n,) pelvis less than 0.42 m over the lower foot, or tipped by more than about 55 degrees; or lost."""
     up = robots.pelvis[:, 2] - robots.ankle[..., 2].amin(1) >= 0.42
     finite = robots.joint_velocity.isfinite().all(1) & robots.velocity.isfinite().all(1)
-    return ~(up & (robots.orientation[:, 2, 2] >= 0.57) & finite)
+    return ~(up & (robots.orientation[:, 2, 2] >= 0.57) & finite) | robots.lost

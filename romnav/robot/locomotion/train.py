@@ -248,7 +248,12 @@ def train(
                 total += reward.mean().item()
             ppo.compute_returns(obs)
         collected = time.monotonic()
-        losses = ppo.update()
+        try:
+            losses = ppo.update()
+        except (RuntimeError, ValueError) as error:
+            # distributions refuse parameters that are not finite, before any loss is reported
+            _check_finite(path, iteration, {"reward": total}, ppo)
+            raise error
         losses["kl"] = adapt(ppo, spec.ppo)
         for name, weight in ppo.actor.named_parameters():
             average[name].lerp_(weight.detach(), 1.0 - spec.ppo.average)
