@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav.kernels import wp
+from romnav.sensing.visibility import Places, place_of
 from romnav.world.solids import Shape, Solids
 
 wp.set_module_options(
@@ -285,7 +286,7 @@ def _finish(
 @wp.kernel
 def draw_columns(
     solids: wp.array(dtype=Solid),
-    first: wp.array(dtype=wp.int32),
+    places: Places,
     image: Image,
     sectors: int,
     tile: wp.array(dtype=wp.int32),
@@ -306,8 +307,9 @@ def draw_columns(
             column += LANES
     cos = wp.cos(yaw[env])
     sin = wp.sin(yaw[env])
-    for i in range(first[tile[env]], first[tile[env] + 1]):
-        _draw(solids[i], image, origin[env], cos, sin, start, stop, env, ranges, labels)
+    place = place_of(places, tile[env], origin[env])
+    for i in range(places.start[place], places.start[place + 1]):
+        _draw(solids[places.solid[i]], image, origin[env], cos, sin, start, stop, env, ranges, labels)
     _finish(image, axis[env], start, stop, env, ranges, labels)
 
 

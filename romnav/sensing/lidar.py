@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from romnav.kernels import wp
-from romnav.sensing import columns
+from romnav.sensing import columns, visibility
 from romnav.sensing.spec import LidarSpec
 from romnav.world.mesh import triangulate
 from romnav.world.solids import Solids
@@ -71,17 +71,18 @@ class Lidar:
                 )
                 for m in meshes
             ]
-            sizes = [len(m.triangles) for m in meshes]
+            first = np.cumsum([0, *(len(m.triangles) for m in meshes)])
             self._scene = [
                 wp.array([m.id for m in self._meshes], dtype=wp.uint64, device=device),
+                wp.array(first, dtype=wp.int32, device=device),
                 wp.array(np.concatenate([m.label for m in meshes]), dtype=wp.int8, device=device),
                 wp.from_torch(self.directions, dtype=wp.vec3),
             ]
         else:
-            sizes = [len(s) for s in solids]
             packed = np.concatenate([columns.pack(s) for s in solids])
-            self._scene = [wp.array(packed, dtype=columns.Solid, device=device)]
-        self._first = wp.array(np.cumsum([0, *sizes]), dtype=wp.int32, device=device)
+            slopes = math.tan(elevation[-1]), math.tan(elevation[0])
+            places = visibility.find(solids, slopes, spec.max_range, device)
+            self._scene = [wp.array(packed, dtype=columns.Solid, device=device), places]
         wp.load_module(columns, device=device)
 
     @overload
@@ -141,14 +142,14 @@ class Lidar:
         vectors = [columns.lanes(ranges), None if labels is None else columns.lanes(labels)]
         stream = None if self.device == "cpu" else wp.stream_from_torch(torch.device(self.device))
         if self.spec.backend == "mesh":
-            meshes, label, directions = self._scene
+            meshes, first, label, directions = self._scene
             out = [wp.from_torch(ranges), None if labels is None else wp.from_torch(labels)]
-            inputs = [meshes, self._first, label, directions, self.spec.max_range, *pose, *out]
+            inputs = [meshes, first, label, directions, self.spec.max_range, *pose, *out]
             wp.launch(columns.cast_rays, (count, rows, width), inputs, device=self.device, stream=stream)
             wp.launch(columns.finish, count, [self._image, mount, *vectors], device=self.device, stream=stream)
         else:
             sectors = 1 if self.device == "cpu" else width // columns.LANES
-            inputs = [*self._scene, self._first, self._image, sectors, *pose, mount, *vectors]
+            inputs = [*self._scene, self._image, sectors, *pose, mount, *vectors]
             wp.launch(columns.draw_columns, (count, sectors), inputs, device=self.device, stream=stream)
 
     def _axis(self, count: int, tilt: Tensor | None) -> Tensor:
