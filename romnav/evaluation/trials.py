@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 
 from romnav import random
@@ -84,39 +83,6 @@ def draw(scenes: Sequence[Scene], world: World, spec: TrialSpec) -> EpisodeSet:
     }
     name = "+".join(scene.name for scene in scenes)
     return EpisodeSet(name, world.spec, {key: value.numpy() for key, value in columns.items()})
-
-
-class TrialView(View):
-    """A view that leads back to the free cells where a body is off them, nearer to a solid than they allow."""
-
-    def __init__(self, world: World, episodes: EpisodeSet, env: EnvSpec, robot: BodyModel) -> None:
-        super().__init__(world, episodes, env, robot)
-        self._world = world
-        self._nearest = torch.from_numpy(_nearest_free(world.node.cpu().numpy() >= 0)).to(world.node.device)
-
-    def geodesic(self) -> tuple[Tensor, Tensor]:
-        """Distance (A,) to the goal and direction (A, 2) of the shortest path, by the nearest free cell."""
-        r, world = self.robot, self._world
-        xy = r.position[:, :2]
-        cell = world.index(xy)
-        off = world.node_at(r.tile, r.layer, xy) < 0
-        nearest = self._nearest[r.tile, r.layer, cell[:, 0], cell[:, 1]]
-        centre = (nearest + 0.5) * world.cell
-        at = torch.where(off[:, None], centre, xy)
-        distance, direction = self._lookup(r.tile, r.layer, at, self.goal)
-        back = at - xy
-        # on along the path and back to it at once: back alone would lead in circles around a corner
-        on = torch.nn.functional.normalize(direction + back / world.cell, dim=1)
-        return distance + torch.linalg.vector_norm(back, dim=1), torch.where(off[:, None], on, direction)
-
-
-def _nearest_free(free: NDArray[np.bool_]) -> NDArray[np.int16]:
-    """(T, L, N, N, 2) the free cell nearest to each cell within its layer; itself where the layer has none."""
-    out = np.empty((*free.shape, 2), np.int16)
-    for t, layer in np.ndindex(free.shape[:2]):
-        indices = ndimage.distance_transform_edt(~free[t, layer], return_distances=False, return_indices=True)
-        out[t, layer] = np.moveaxis(indices, 0, -1)
-    return out
 
 
 class Shield:
@@ -217,7 +183,7 @@ def _drive(
 ) -> tuple[dict[str, NDArray], _Log]:
     count, limit = len(episodes), round(spec.duration / env.period)
     robot = BodyModel(world, count, env.period, spec.body)
-    view = TrialView(world, episodes, env, robot)
+    view = View(world, episodes, env, robot)
     view.noise = view.episode % (count // 2)
     filtered = filtered.to(view.episode.device)
     guarded = filtered.nonzero()[:, 0]

@@ -136,7 +136,14 @@ class Stages:
         from romnav.robot.locomotion.train import train, training_cost
 
         settings = cast(Scale, stage.settings)
-        path = train(settings.locomotion, stage.folder, device=self.device, resume=self.resume, progress=progress)
+        path = train(
+            settings.locomotion,
+            stage.folder,
+            device=self.device,
+            resume=self.resume,
+            progress=progress,
+            worlds=self._worlds,
+        )
         return training_cost(path)
 
     def terrain(self, stage: Stage, progress: Progress) -> dict[str, Any]:

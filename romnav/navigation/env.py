@@ -207,6 +207,11 @@ class NavigationEnv(VecEnv):
         d = self.dynamics
         return self._lookup(d.tile, d.layer, d.position[:, :2], self._goal)
 
+    def _measure_of(self, envs: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the robots ``envs`` (K,) where their bodies are: a gait's placement is up to 0.3 m from the start."""
+        d = self.dynamics
+        return self._lookup(d.tile[envs], d.layer[envs], d.position[envs, :2], self._goal[envs])
+
     def _reward(self, command: Tensor) -> Tensor:
         offset = self._goal_position - self.dynamics.position
         height = offset[:, 2].abs()
@@ -247,7 +252,7 @@ class NavigationEnv(VecEnv):
         d = self.dynamics
         d.reset(envs, start)
         self._goal[envs] = start.goal
-        self._geodesic[envs], self._direction[envs] = self._lookup(start.tile, start.layer, start.xy, start.goal)
+        self._geodesic[envs], self._direction[envs] = self._measure_of(envs)
         self._goal_position[envs] = self.world.position[self.world.goal[start.goal]]
         self._goal_yaw[envs] = start.goal_yaw
         self._command[envs] = 0.0

@@ -109,6 +109,9 @@ class EncoderUseSpec(Config):
 class PPOSpec(Config):
     """PPO (Schulman et al., 2017) as rsl-rl implements it."""
 
+    stages: int = 1
+    """Times `iterations` that a run takes. Single-Stage takes as many as both stages of RoM-Nav together (P: 4000);
+    what is a share of `iterations`, the switch of the action rate, stays where it is."""
     iterations: int = 2000
     """Iterations of one rollout and one update each (P)."""
     steps: int = 36

@@ -74,7 +74,7 @@ def _train(
     obs = env.get_observations()
     ppo = make_ppo(obs, spec.policy, spec.ppo, spec.env.envs, device)
     identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
-    total = spec.ppo.iterations
+    total = spec.ppo.iterations * spec.ppo.stages
     unfreeze_at = round(spec.encoder.unfreeze_at * total)
     state = out / "checkpoint.pt"
     done, seconds, curve = 0, 0.0, []
@@ -93,17 +93,23 @@ def _train(
     while done < total:
         if done == unfreeze_at:
             obs = _unfreeze(ppo, env, perception)
-        env.progress = done / total
+        env.progress = done / spec.ppo.iterations
         with torch.inference_mode():
             for _ in range(spec.ppo.steps):
                 obs, reward, dones, extras = env.step(ppo.act(obs))
                 ppo.process_env_step(obs, reward, dones, extras)
             ppo.compute_returns(obs)
-        losses = ppo.update()
+        try:
+            losses = ppo.update()
+        except (RuntimeError, ValueError) as error:
+            # distributions refuse parameters that are not finite, before any loss is reported
+            _check_finite(state, done + 1, {}, ppo)
+            raise error
         done += 1
         seconds = before + time.monotonic() - started
         cpu_seconds = cpu_before + time.process_time() - cpu_started
         curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate))
+        _check_finite(state, done, curve[-1], ppo)
         if progress:
             progress(done * steps, total * steps, _summary(curve))
         if time.monotonic() - saved_at > SAVE_EVERY and done < total:
@@ -172,6 +178,19 @@ def _row(
     row |= {f"reward_{name}": value for name, value in s.reward.items()}
     row |= {f"loss_{name}": value for name, value in losses.items()}
     return row | {"learning_rate": rate}
+
+
+def _check_finite(path: Path, iteration: int, row: dict[str, float], ppo: BoundedPPO) -> None:
+    """Stop before what is not finite is saved; observations that are not end in the normalisers' weights."""
+    wrong = [name for name, value in row.items() if name.startswith(("loss_", "reward_")) and not math.isfinite(value)]
+    for owner, model in (("actor", ppo.actor), ("critic", ppo.critic)):
+        weights = model.state_dict().items()
+        wrong += [f"{owner} {name}" for name, value in weights if not bool(value.isfinite().all())]
+    if wrong:
+        raise RomnavError(
+            f"{path}: iteration {iteration}: {', '.join(wrong[:3])} not finite; a checkpoint there is of one before. "
+            "Lower navigation.ppo.learning_rate_range, or look at the settings"
+        )
 
 
 def _summary(curve: list[dict[str, float]], window: int = 10) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.resources
 from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
@@ -27,6 +28,8 @@ SOLE = (0.035, 0.0, -0.035)
 FOOT_LENGTH, FOOT_WIDTH = 0.185, 0.07
 """Size of the sole, m."""
 _SOLE_RADIUS = 0.01
+_BEGIN = 1.0
+"""Time of a robot that is placed, s: one that MuJoCo had to reset is at 0."""
 
 
 class Statics(Protocol):
@@ -178,6 +181,7 @@ class Robots(ABC):
         anchor, axis: (n, 15, 3) joint anchors and axes, world.
         touch: (n, bodies) whether each collision body is in contact; `feet` are the columns of the feet.
         torque: (n, 15) of the actuators, N m.
+        lost: (n,) whether the state stopped being finite since the robot was placed: the engine began anew.
     """
 
     def __init__(self, spec: RobotSpec, ground: Statics, count: int) -> None:
@@ -197,6 +201,7 @@ class Robots(ABC):
         self._ankles = [self.model.body(f"{side}_ankle_roll_link").id for side in SIDES]
         self.touch = torch.zeros(count, len(touch), dtype=torch.bool)
         self.torque = torch.zeros(count, len(JOINTS))
+        self.lost = torch.zeros(count, dtype=torch.bool)
 
     @abstractmethod
     def _field(self, name: str) -> Tensor:
@@ -234,6 +239,7 @@ class Humanoids(Robots):
 
     def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
         super().__init__(spec, ground, count)
+        self._models: list[mujoco.MjModel] = []
         self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
         for field in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             self.batch.bind(field)
@@ -245,6 +251,7 @@ class Humanoids(Robots):
     def stand_on(self, models: list[mujoco.MjModel]) -> None:
         """Give every robot the model it is in from now on, of `build_spec` with as many geoms as this one's."""
         self.batch.set_models(models)
+        self._models = models
 
     def _field(self, name: str) -> Tensor:
         return _single(getattr(self.batch, name))
@@ -258,7 +265,13 @@ class Humanoids(Robots):
         """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms); all, or only `ids`."""
         self.batch.ctrl[:] = target.numpy()
         index = None if ids is None else ids.numpy()
+        before = self.batch.time.copy()
         self.batch.step(ids=index, nstep=self.spec.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        # MuJoCo resets what blows up, the clock too, to a robot that stands at the origin.
+        stepped = np.zeros(self.count, bool)
+        stepped[slice(None) if index is None else index] = True
+        due = before + 0.5 * self.spec.decimation * self.spec.timestep
+        self.lost |= torch.from_numpy(stepped & (self.batch.time < due).reshape(-1))
         self.touch = torch.from_numpy(self.batch.sensordata[:, self._touch] > 0)
         self.torque = _single(self.batch.actuator_force)
         self._read()
@@ -269,11 +282,13 @@ class Humanoids(Robots):
             return
         index = ids.numpy()
         self.batch.reset(ids=index, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.batch.time[index] = _BEGIN
         self.batch.qpos[index] = qpos.double().numpy()
         self.batch.qvel[index] = qvel.double().numpy()
         self.batch.forward(ids=index, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.touch[ids] = False
         self.torque[ids] = 0.0
+        self.lost[ids] = False
         self._read()
 
     def push(self, ids: Tensor, velocity: Tensor) -> None:
@@ -287,16 +302,32 @@ class Humanoids(Robots):
     def randomize(self, friction: Tensor, payload: Tensor) -> None:
         """Give every robot its own foot friction (n,) and torso payload (n,), kg."""
         soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in range(6)]
+        if self._models:
+            self.stand_on(
+                [
+                    self._own(model, soles, float(slip), float(load))
+                    for model, slip, load in zip(self._models, friction, payload, strict=True)
+                ]
+            )
+            return
         self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
         torso = self.model.body("torso_link").id
         self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
         self.batch.set_const()
 
+    @staticmethod
+    def _own(model: mujoco.MjModel, soles: list[int], friction: float, payload: float) -> mujoco.MjModel:
+        own = copy.copy(model)
+        own.geom_friction[soles, 0] = friction
+        own.body_mass[own.body("torso_link").id] += payload
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        return own
+
     def state_dict(self) -> dict[str, NDArray]:
         """All that decides the future: MuJoCo's integration state and the last contacts."""
         names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
         return {name: getattr(self.batch, name).copy() for name in names} | {
-            "touch": self.touch.numpy().copy(), "torque": self.torque.numpy().copy(),
+            "touch": self.touch.numpy().copy(), "torque": self.torque.numpy().copy(), "lost": self.lost.numpy().copy(),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, NDArray]) -> None:
@@ -308,4 +339,6 @@ class Humanoids(Robots):
             torch.from_numpy(state["touch"].copy()),
             torch.from_numpy(state["torque"].copy()),
         )
+        if "lost" in state:
+            self.lost = torch.from_numpy(state["lost"].copy())
         self._read()

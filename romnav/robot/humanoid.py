@@ -16,7 +16,7 @@ from romnav.robot.g1 import Humanoids, build_spec
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
-from romnav.robot.tiles import TileGeoms, TileHeights
+from romnav.robot.tiles import TileGeoms, TileHeights, change_layer
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.world import World
@@ -97,7 +97,7 @@ class Humanoid:
         self.tile[envs], self.layer[envs] = start.tile, start.layer
         self._enter_tiles()
         self._resets[envs] += 1
-        z = self.world.surface(start.tile, start.layer, start.xy)
+        z = self._under(envs, start)
         clock = self._draw(envs, _CLOCK, 2) * self._spec.gait.step_ticks
         still = torch.zeros(len(envs), 3)
         self.control.stand(envs, torch.cat([start.xy, z[:, None]], dim=1), start.yaw, clock, still)
@@ -107,6 +107,13 @@ class Humanoid:
         self.contacts[envs], self.fallen[envs] = 0.0, False
         self._read()
 
+    def _under(self, envs: Tensor, start: Start) -> Tensor:
+        """(K,) height of the surface under the starts themselves, not under the middles of their cells."""
+        xy, reach = self.position[:, :2].clone(), torch.zeros(len(self.tile))
+        xy[envs] = start.xy
+        reach[envs] = self.world.surface(start.tile, start.layer, start.xy) + STEP_UP
+        return self._heights(xy, reach)[envs]
+
     def _draw(self, envs: Tensor, purpose: int, high: int) -> Tensor:
         return random.integers(high, self.seed, self._env[envs], self._resets[envs], purpose)
 
@@ -115,12 +122,13 @@ class Humanoid:
         solids = self.world.tiles[tile].solids
         (u,), (v,) = (part.T for part in solids.local(xy[None]))
         top = solids.top + solids.slope_top * u
-        slope = np.isin(solids.label, (Label.STAIR, Label.RAMP)) & solids.walkable & (np.abs(top - z) < 0.02)
-        on = np.flatnonzero(slope & (np.abs(u) <= solids.half[:, 0]) & (np.abs(v) <= solids.half[:, 1]))
+        under = solids.walkable & (np.abs(u) <= solids.half[:, 0]) & (np.abs(v) <= solids.half[:, 1])
+        under &= np.abs(top - z) < 0.02
+        slope = under & np.isin(solids.label, (Label.STAIR, Label.RAMP))
         found = self._flight(tile, xy, z)
-        if len(on) == 0 or found is None:
+        if not slope.any() or found is None:
             return
-        step, (along, steepness) = on[0], found
+        step, (along, steepness) = np.flatnonzero(slope)[0], found
         kind = "ramp" if solids.label[step] == Label.RAMP else "stair"
         forward = 1.0 if np.cos(float(yaw) - along) >= 0 else -1.0
         side = max(solids.half[step, 1] - FOOTING, 0.0)
@@ -170,17 +178,16 @@ class Humanoid:
 
     def _read(self) -> None:
         """Poses and layers from the physics."""
-        xy = self.robots.pelvis[:, :2]
+        pelvis = self.robots.pelvis
         reach = self.control.walker.soles(self.robots)[..., 2].amin(1) + STEP_UP
-        z = self._heights(xy, reach)
+        yaw = heading_of(self.robots.orientation)
+        # Physics that blew up counts as a fall, where the robot was last.
+        finite = pelvis.isfinite().all(1) & yaw.isfinite() & reach.isfinite() & ~self.robots.lost
+        xy = torch.where(finite[:, None], pelvis[:, :2], self.position[:, :2])
+        z = torch.where(finite, self._heights(xy, reach), self.position[:, 2])
         self.position = torch.cat([xy, z[:, None]], dim=1)
-        self.yaw = heading_of(self.robots.orientation)
-        world = self.world
-        up = (z > world.switch[self.tile, self.layer + 1]).long()
-        down = (z <= world.switch[self.tile, self.layer]).long()
-        layer = self.layer + up - down
-        exists = world.surface(self.tile, layer.clamp(0, world.height.shape[1] - 1), xy).isfinite()
-        self.layer = torch.where(exists, layer, self.layer)
+        self.yaw = torch.where(finite, yaw, self.yaw)
+        self.layer = change_layer(self.world, self.tile, self.layer, xy, z)
 
     def select(self, envs: Tensor) -> None:
         """Keep only the robots ``envs`` (K,), in that order."""

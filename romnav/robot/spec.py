@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from romnav.config import Config
+from romnav.world.spec import WorldSpec
 
 
 class BodySpec(Config):
@@ -178,6 +179,38 @@ class TaskSpec(Config):
     """Range of mass added to the torso, kg."""
 
 
+class TileTaskSpec(Config):
+    """Locomotion as navigation asks for it: robots among the walls and stairs of tiles, commanded at 5 Hz (A)."""
+
+    robots: int = 0
+    """Robots on tiles, besides those on lanes."""
+    begin: int = 0
+    """Iterations before they join: until then the run is one without them."""
+    world: WorldSpec = WorldSpec(tiles=48, goals_per_tile=32, classes=("building", "outdoor", "building"))
+    """The tiles; classes without stairs teach little that lanes do not."""
+    drivers: dict[str, float] = Field(default={"steps": 0.15, "smooth": 0.15, "oracle": 0.7})
+    """Share of the episodes under commands that are drawn over the whole limits and held, under such that wander
+    through them, and under the shortest path to a goal."""
+    period: float = 0.2
+    """Time for which a command is held, s (P: navigation's)."""
+    hold: tuple[float, float] = (0.2, 3.0)
+    """Time for which a drawn command is held, s."""
+    speed: tuple[float, float] = (0.4, 1.0)
+    """Speed along the shortest path, m/s; one for an episode."""
+    fast: float = 0.5
+    """Share of the episodes along shortest paths at the full speed."""
+    stray: float = 0.4
+    """Largest angle off the shortest path, rad, as it wanders."""
+    burst: float = 0.03
+    """Chance at each command of the shortest path that a drawn one takes over for a while."""
+    mouth: float = 0.5
+    """Share of the starts beside the end of a stair or ramp."""
+    wall: float = 0.25
+    """Share of the starts beside an obstacle or an edge."""
+    cross: float = 0.75
+    """Share of the goals on another level than the start, where there are any."""
+
+
 class PpoSpec(Config):
     """PPO by rsl-rl."""
 
@@ -214,8 +247,14 @@ class LocomotionSpec(Config):
     clf: ClfSpec = ClfSpec()
     reward: RewardSpec = RewardSpec()
     task: TaskSpec = TaskSpec()
+    tiles: TileTaskSpec = TileTaskSpec()
     ppo: PpoSpec = PpoSpec()
     iterations: int = 4000
     """PPO iterations."""
     seed: int = 1
     """Of everything random."""
+
+    def steps(self, iteration: int) -> int:
+        """Policy steps until the end of an iteration."""
+        joined = max(iteration - self.tiles.begin, 0)
+        return self.ppo.steps * (iteration * self.task.robots + joined * self.tiles.robots)

@@ -14,6 +14,7 @@ from torch import Tensor
 from romnav.world.mesh import triangulate
 from romnav.world.solids import Shape, Solids, SolidsBuilder
 from romnav.world.tile import Tile
+from romnav.world.world import World
 
 CELL = 0.025
 """Cell of the height maps, m: a tenth of a tread."""
@@ -159,3 +160,12 @@ class TileHeights:
         allowed = (at != NOWHERE) & (height <= reach[..., None])
         below = torch.where(allowed, height, -torch.inf).amax(-1)
         return torch.where(below.isfinite(), below, 0.0)
+
+
+def change_layer(world: World, tile: Tensor, layer: Tensor, xy: Tensor, z: Tensor) -> Tensor:
+    """Layers (n,) of robots that were on `layer` (n,) and are at `xy` (n, 2) and height `z` (n,) of a tile (n,) now."""
+    up = (z > world.switch[tile, layer + 1]).long()
+    down = (z <= world.switch[tile, layer]).long()
+    now = layer + up - down
+    exists = world.surface(tile, now.clamp(0, world.height.shape[1] - 1), xy).isfinite()
+    return torch.where(exists, now, layer)

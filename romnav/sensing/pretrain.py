@@ -207,6 +207,12 @@ class _Training:
         for group in self._optimizer.param_groups:
             group["lr"] = rate
         terms = self._terms()
+        wrong = [name for name, value in zip(TERMS, terms.tolist(), strict=True) if not math.isfinite(value)]
+        if wrong:
+            raise RomnavError(
+                f"pretraining: step {self.step + 1}: {', '.join(wrong)} of the loss is not finite; what is saved is "
+                "of a step before. Lower learning_rate"
+            )
         self._optimizer.zero_grad()
         terms.sum().backward()
         torch.nn.utils.clip_grad_norm_(self._parameters, spec.max_grad_norm)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 
 from romnav.kernels import wp
@@ -576,14 +577,27 @@ class GeodesicLookup:
             ("link", np.concatenate(links), wp.int32),
         ):
             setattr(self._paths, key, wp.array(value, dtype=kind, device=str(world.node.device)))
+        self._nearest = torch.from_numpy(_nearest_free(world.node.cpu().numpy())).to(world.node.device)
 
     def __call__(self, tile: Tensor, layer: Tensor, xy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Planar distance (E,), m, and unit direction (E, 2) of the shortest path to goals (E,).
 
-        Robots are at ``xy`` (E, 2), m, on a layer of a tile (E,). Off the free cells the distance is infinite and
-        the direction zero.
+        Robots are at ``xy`` (E, 2), m, on a layer of a tile (E,). A body may be off the free cells, nearer to a solid
+        than they allow: it goes to the nearest free cell of its layer first.
         """
-        node = self._world.node_at(tile, layer, xy)
+        free = self._world.node_at(tile, layer, xy)
+        cell = self._world.index(xy)
+        node = torch.where(free >= 0, free, self._nearest[tile, layer, cell[:, 0], cell[:, 1]].long())
+        off = (free < 0)[:, None]
+        at = torch.where(off, self._world.position[node, :2], xy)
+        distance, direction = self._look(node, at, goal)
+        back = at - xy
+        # on along the path and back to it at once: back alone would lead in circles around a corner
+        on = torch.nn.functional.normalize(direction + back / self._world.cell, dim=1)
+        return distance + torch.linalg.vector_norm(back, dim=1), torch.where(off, on, direction)
+
+    def _look(self, node: Tensor, xy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """The same at positions (E, 2) in the cells of nodes (E,)."""
         distance = torch.empty(len(xy), device=xy.device)
         direction = torch.empty(len(xy), 2, device=xy.device)
         wp.launch(
@@ -600,3 +614,18 @@ class GeodesicLookup:
             device=str(xy.device),
         )
         return distance, direction
+
+
+def _nearest_free(node: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(T, L, N, N) nearest free node to each cell within its layer; where a layer has none, any of the tile."""
+    out = np.empty_like(node)
+    for t in range(len(node)):
+        anywhere = node[t].max()
+        for k, layer in enumerate(node[t]):
+            free = layer >= 0
+            if not free.any():
+                out[t, k] = anywhere
+                continue
+            x, y = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
+            out[t, k] = layer[x, y]
+    return out

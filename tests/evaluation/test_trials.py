@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from romnav.evaluation import trials
-from romnav.evaluation.rollout import Oracle, Straight
+from romnav.evaluation.rollout import Oracle, Straight, View
 from romnav.evaluation.spec import TrialSpec
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.body import BodyModel
@@ -104,7 +104,7 @@ def test_two_runs_are_the_same_and_a_trial_does_not_depend_on_the_others(scenes,
 def test_off_the_free_cells_the_oracle_finds_back(scenes, world: World) -> None:
     spec = TrialSpec(trials=1)
     robot = BodyModel(world, 3, 0.2)
-    view = trials.TrialView(world, trials.draw(scenes, world, spec), EnvSpec(), robot)
+    view = View(world, trials.draw(scenes, world, spec), EnvSpec(), robot)
     robot.position[:, :2] = torch.tensor([1.06, 5.0])  # the wall's inner face is at 0.8 m
     assert (world.node_at(robot.tile, robot.layer, robot.position[:, :2]) < 0).all()
     distance, direction = view.geodesic()

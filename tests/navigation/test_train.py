@@ -23,7 +23,7 @@ from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train as train_locomotion
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
-from romnav.world.spec import WorldSpec
+from romnav.world.spec import SamplerSpec, WorldSpec
 from romnav.world.world import World, build
 
 from .conftest import TOKENS, FakePerception, fake_encoder
@@ -186,6 +186,27 @@ def test_learning_rate_stays_in_bounds(world: World, perception: object, spec: N
     assert all(low <= rate <= high for rate in rates)
 
 
+def test_what_is_not_finite_stops_the_run_and_is_not_saved(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "SAVE_EVERY", 0.0)
+    broken = spec.model_copy(update={"ppo": spec.ppo.model_copy(update={"gamma": float("nan")})})
+    with pytest.raises(RomnavError, match=r"iteration 1: .* not finite"):
+        train.train(broken, world, perception, tmp_path, 1)
+    assert not list(tmp_path.glob("*.pt"))
+
+
+def test_a_longer_run_switches_where_the_shorter_one_does(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[float] = []
+    row = train._row
+    monkeypatch.setattr(train, "_row", lambda *a: seen.append(a[4].progress) or row(*a))
+    twice = spec.model_copy(update={"ppo": spec.ppo.model_copy(update={"iterations": 2, "stages": 2})})
+    train.train(twice, world, perception, tmp_path, 1)
+    assert seen == [0.0, 0.5, 1.0, 1.5]
+
+
 def test_learning_raises_the_return(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
     """Paid for steady commands alone, the policy becomes steady: the sign of every gradient is right."""
     terms = {name: 0.0 for name in RewardSpec.model_fields if name in TERMS}
@@ -245,7 +266,10 @@ def test_policy_errors_name_file_and_fix(
         checkpoint.read(tmp_path / "foreign.pt")
 
 
-def test_a_run_on_the_humanoid_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("library", [None, "results/cpu/locomotion/gaits.pt"], ids=["standing", "walking"])
+def test_a_run_on_the_humanoid_resumes_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str | None
+) -> None:
     """Stopped after half of its iterations: the robots walk on from where they were."""
     monkeypatch.setattr(train, "SAVE_EVERY", 0.0)
     world = build(WorldSpec(tiles=2, seed=5, goals_per_tile=4))
@@ -253,10 +277,11 @@ def test_a_run_on_the_humanoid_resumes_exactly(tmp_path: Path, monkeypatch: pyte
         task=TaskSpec(robots=4, shares={"flat": 1.0}), ppo=PpoSpec(steps=2, epochs=1, minibatches=1), iterations=1
     )
     walk = train_locomotion(tiny, tmp_path, threads=1)
-    body = partial(Humanoid, checkpoint=walk, gaits=GaitLibrary([]), threads=1)
+    gaits = GaitLibrary.load(Path(__file__).parents[2] / library) if library else GaitLibrary([])
+    body = partial(Humanoid, checkpoint=walk, gaits=gaits, threads=1)
     spec = NavigationSpec(
         dynamics="g1",
-        env=EnvSpec(envs=3, duration=2.0),
+        env=EnvSpec(envs=3, duration=2.0, sampler=SamplerSpec(stair_probability=1.0)),
         policy=PolicySpec(attention=16, heads=2, queries=2, recurrent=16, hidden=16, critic=(16,)),
         ppo=PPOSpec(iterations=2, steps=6, epochs=1, minibatches=3),
     )

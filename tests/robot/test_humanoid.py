@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,40 @@ def test_a_start_on_a_stair_faces_along_it_on_the_middle_of_a_tread(world: World
     assert abs(np.sin(2 * (float(body.yaw[0]) - solids.yaw[tread]))) < 1e-3
     there = world.surface(start.tile[:1], start.layer[:1], torch.tensor(ahead[None], dtype=torch.float32))
     assert there.isnan() or abs(float(there) - float(z[0])) > 0.05, "up or down within half a metre"
+
+
+def test_starts_jittered_within_stair_cells_stand_on_the_surface_under_them(world: World, checkpoint: Path) -> None:
+    nodes = world.spawn[world.spawn < world.node_start[1]][:40]
+    start = starts(world, nodes, torch.zeros(len(nodes)))
+    jitter = 0.09 * torch.stack([torch.cos(1.0 * nodes), torch.sin(1.0 * nodes)], dim=1)
+    start = replace(start, xy=start.xy + jitter)
+    solids, on_tread, met = world.tiles[0].solids, [], []
+    body = robot(world, len(nodes), checkpoint)
+    monkey = body._put_on_slope
+    heights: list[float] = []
+    body._put_on_slope = lambda env, tile, xy, z, yaw: (heights.append(z), monkey(env, tile, xy, z, yaw))[1]  # type: ignore[method-assign]
+    body.reset(torch.arange(len(nodes)), start)
+    for k, node in enumerate(nodes.tolist()):
+        tops = [solids.top[i] for i in _over(solids, start.xy[k].numpy()) if solids.walkable[i]]
+        middle = float(world.position[node, 2])
+        near = [top for top in tops if top < middle + 0.3]
+        on_tread.append(max(near))
+        met.append(heights[k])
+    flat = [abs(a - b) < 0.002 for a, b in zip(on_tread, met, strict=True)]
+    assert np.mean(flat) > 0.95, "but for ramps and the 2.5 cm cells of the height map"
+
+
+def test_a_robot_that_is_not_finite_has_fallen_where_it_was(world: World, checkpoint: Path) -> None:
+    nodes = level_nodes(world, 2)
+    body = robot(world, 2, checkpoint)
+    body.reset(torch.arange(2), starts(world, nodes, torch.zeros(2)))
+    before = body.position.clone()
+    body.robots.batch.qvel[1, 8] = np.nan
+    body.step(torch.zeros(2, 3))
+    assert body.fallen.tolist() == [False, True]
+    assert body.position.isfinite().all()
+    assert body.yaw.isfinite().all()
+    assert (body.position[1] - before[1]).norm() < 0.3
 
 
 def _over(solids: object, xy: np.ndarray) -> list[int]:

@@ -238,12 +238,25 @@ def test_lookup_is_continuous(world: World) -> None:
     assert jump.quantile(0.99) < 0.002
 
 
-def test_lookup_off_the_free_cells_is_infinite(world: World) -> None:
+def test_lookup_off_the_free_cells_leads_to_the_nearest_one(world: World) -> None:
     lookup = GeodesicLookup(world)
-    one = torch.zeros(1, dtype=torch.int64)
-    distance, direction = lookup(one, one, torch.full((1, 2), -1.0), one)
-    assert distance.isinf().all()
-    assert not direction.any()
+    taken = (world.node[0, 0] < 0).nonzero()[::7]
+    at = (taken + 0.5) * world.cell
+    zero = torch.zeros(len(at), dtype=torch.int64)
+    distance, direction = lookup(zero, zero, at, zero)
+    assert distance.isfinite().all()
+    torch.testing.assert_close(direction.norm(dim=1), torch.ones(len(at)))
+    free = ((world.node[0, 0] >= 0).nonzero() + 0.5) * world.cell
+    apart = torch.cdist(at.double(), free.double())
+    nearest = apart.amin(1)
+    # the nearest cells by brute force: the way leads over one of them
+    zeros = torch.zeros(len(free), dtype=torch.int64)
+    onward, _ = lookup(zeros, zeros, free, zeros)
+    ways = torch.where(apart < nearest[:, None] + 1e-6, onward + apart, torch.inf)
+    closest = (ways - distance[:, None]).abs().nan_to_num(torch.inf).amin(1)
+    assert closest.max() < 1e-3
+    outside, _ = lookup(zero[:1], zero[:1], torch.full((1, 2), -1.0), zero[:1])
+    assert outside.isfinite().all()
 
 
 def test_descent_reaches_the_goal_along_the_shortest_path(world: World) -> None:

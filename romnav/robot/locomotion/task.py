@@ -213,47 +213,33 @@ def tracking_error(
     return error, rate
 
 
-class LocomotionEnv(VecEnv):
-    """Robots on the lanes of a `Ground`, each kind of terrain with its own robots and levels.
+class WalkingEnv(VecEnv):
+    """Robots that are to walk as commanded: reward, observation, pushes. Where, and who commands, is a subclass's.
 
-    A robot on a lane walks it from a level place to the end under `steer`; it moves up a level when it has
-    covered most of the way in good time and down when it falls early. Distance counts along the lane's path only.
+    Args:
+        spec: of the task.
+        robots: that walk.
+        ground: under them.
+        seed: of everything random.
     """
 
-    def __init__(self, spec: LocomotionSpec, lanes: list[Lane], *, threads: int = 0) -> None:
+    STATE: tuple[str, ...] = (
+        "command", "episode_length_buf", "average", "value", "_slope", "_reward", "first",
+    )  # fmt: skip
+    """What changes besides robots and controller."""
+
+    def __init__(self, spec: LocomotionSpec, robots: Humanoids, ground: Heights, seed: int) -> None:
         self.spec, self.cfg = spec, spec.model_dump()
-        t = spec.task
-        self.num_envs, self.num_actions, self.device = t.robots, TARGETS, "cpu"
-        self.ground = Ground(lanes)
-        self.robots = Humanoids(spec.robot, self.ground.boxes, t.robots, threads=threads)
+        self.robots, self.heights = robots, ground
+        t, n = spec.task, robots.count
+        self.num_envs, self.num_actions, self.device = n, TARGETS, "cpu"
         self.control = Controller(spec, self.robots)
         self.dt = self.control.dt
         self.max_episode_length = round(t.episode / self.dt)
-        self.random = torch.Generator().manual_seed(spec.seed)
+        self.random = torch.Generator().manual_seed(seed)
         self.clf = Clf(spec.clf.rate_time, spec.clf.effort)
         c = spec.clf
         self._tolerance = torch.tensor([c.com] * 2 + [c.height] + [c.tilt] * 3 + [c.swing] * 3 + [c.foot] * 2)
-
-        self.kinds = list(t.shares)
-        self._by_kind = [[i for i, lane in enumerate(lanes) if lane.kind == kind] for kind in self.kinds]
-        edges = np.round(np.cumsum([0.0, *t.shares.values()]) / sum(t.shares.values()) * t.robots).astype(int)
-        self.kind = torch.zeros(t.robots, dtype=torch.long)
-        for k, (a, b) in enumerate(pairwise(edges)):
-            self.kind[a:b] = k
-        self.flat = self.kind == self.kinds.index("flat")
-        self._top = torch.tensor([len(group) - 1 for group in self._by_kind])[self.kind]
-        self._lane_table = torch.tensor([g + [g[-1]] * (max(map(len, self._by_kind)) - len(g)) for g in self._by_kind])
-
-        n = t.robots
-        self.level = torch.zeros(n, dtype=torch.long)
-        self.tried = torch.zeros(n, dtype=torch.long)
-        self.lane = torch.zeros(n, dtype=torch.long)
-        self.arc, self.start, self.forward, self.speed = (
-            torch.zeros(n),
-            torch.zeros(n),
-            torch.ones(n),
-            torch.zeros(n),
-        )
         self.command = torch.zeros(n, 3)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
         self.average = torch.zeros(n, 3)
@@ -268,15 +254,38 @@ class LocomotionEnv(VecEnv):
         self.payload = self._uniform(*t.payload)
         self.robots.randomize(self.friction, self.payload)
         self.first = torch.ones(n, dtype=torch.bool)
-        self._place(torch.arange(n))
+
+    def _begin(self) -> None:
+        """Place all robots for the first time."""
+        self._place(torch.arange(self.num_envs))
         self._refer()
+
+    def _start(self, ids: Tensor) -> tuple[Tensor, Tensor]:
+        """Begin episodes of robots `ids` and command them; position (k, 3) of the ground and heading (k,) there."""
+        raise NotImplementedError
+
+    def _drive(self) -> None:
+        """Command the robots in the state that they are in now."""
+        raise NotImplementedError
+
+    def _judge(self, fell: Tensor) -> tuple[Tensor, Tensor]:
+        """(n,) who has failed, of those that fell and others, and (n,) whose episode is over without a failure."""
+        raise NotImplementedError
+
+    def _finish(self, ids: Tensor, fell: Tensor, over: Tensor) -> dict[str, float]:
+        """Learn from episodes `ids` that have ended; what to log."""
+        raise NotImplementedError
+
+    def _renew(self, done: Tensor) -> None:
+        """New commands for robots that are in the middle of an episode, not `done`."""
 
     def _uniform(self, low: float, high: float, count: int | None = None) -> Tensor:
         return low + (high - low) * torch.rand(self.num_envs if count is None else count, generator=self.random)
 
-    def _new_commands(self, ids: Tensor) -> None:
+    def _draw_commands(self, k: int) -> Tensor:
+        """(k, 3) commands over the whole limits: a tenth stands still, a fifth walks straight, two fifths are at the
+        corners, the hardest to track."""
         t = self.spec.task
-        k = len(ids)
         draw = torch.stack(
             [
                 self._uniform(*t.forward, k),
@@ -285,44 +294,21 @@ class LocomotionEnv(VecEnv):
             ],
             1,
         )
-        # A tenth stands still, a fifth walks straight, two fifths are at the corners, the hardest to track.
         u = self._uniform(0.0, 1.0, k)
         draw[u < 0.1] = 0.0
         draw[(u > 0.1) & (u < 0.3), 1:] = 0.0
         corner = torch.tensor([[t.forward[0]], [t.forward[1]]])[(self._uniform(0, 1, k) < 0.5).long()]
         signs = torch.sign(self._uniform(-1.0, 1.0, 2 * k)).reshape(k, 2) * torch.tensor([t.lateral, t.turn])
-        draw = torch.where((u > 0.6)[:, None], torch.cat([corner, signs], 1), draw)
-        self.command[ids] = draw
+        return torch.where((u > 0.6)[:, None], torch.cat([corner, signs], 1), draw)
 
     def _place(self, ids: Tensor) -> None:
         """Start new episodes."""
         k = len(ids)
         if k == 0:
             return
-        t, g = self.spec.task, self.ground
-        any_level = (self._uniform(0.0, 1.0, k) * (self._top[ids] + 1)).long()
-        own = self._uniform(0.0, 1.0, k) >= t.explore
-        self.tried[ids] = torch.where(own, self.level[ids], any_level)
-        self.lane[ids] = self._lane_table[self.kind[ids], self.tried[ids]]
-        lane = self.lane[ids]
-        pick = (self._uniform(0.0, 1.0, k) * g.spawn.shape[1]).long()
-        arc = g.spawn[lane].gather(1, pick[:, None])[:, 0] + self._uniform(-0.4, 0.4, k)
-        coin = torch.where(self._uniform(0.0, 1.0, k) < 0.5, -1.0, 1.0)
-        ends = torch.where(arc < 1.3, 1.0, torch.where(arc > g.length[lane] - 1.3, -1.0, coin))
-        self.forward[ids] = torch.where(self.flat[ids], 1.0, ends)
-        self.arc[ids] = self.start[ids] = arc
-        self.speed[ids] = self._uniform(*t.lane_speed, k)
-        self.command[ids] = 0.0
-        self._new_commands(ids[self.flat[ids]])
-        self.command[ids, 0] = torch.where(self.flat[ids], self.command[ids, 0], self.speed[ids])
-        at, ahead = g.at(lane, arc), g.at(lane, arc + 0.1 * self.forward[ids])
-        to = ahead - at
-        heading = torch.atan2(to[:, 1], to[:, 0]) + self._uniform(-0.2, 0.2, k)
-        heading = torch.where(self.flat[ids], self._uniform(-torch.pi, torch.pi, k), heading)
-        at = at + self._uniform(-0.2, 0.2, 2 * k).reshape(k, 2) * torch.tensor([0.0, 1.0])
-        z = g.map(at, torch.full((k,), 9.0))
+        at, heading = self._start(ids)
         clock = (self._uniform(0.0, 2.0, k)).long() * self.spec.gait.step_ticks
-        self.control.stand(ids, torch.cat([at, z[:, None]], 1), heading, clock, self.command[ids])
+        self.control.stand(ids, at, heading, clock, self.command[ids])
         self.episode_length_buf[ids] = 0
         self.average[ids] = self.command[ids]
         self._last["action"][ids] = 0.0
@@ -330,12 +316,8 @@ class LocomotionEnv(VecEnv):
 
     def _refer(self) -> None:
         """Commands, the reference and V of the state as it is now."""
-        yaw = heading_of(self.robots.orientation)
-        xy = self.robots.pelvis[:, :2]
-        self.arc = torch.where(self.flat, self.arc, self.ground.project(self.lane, xy, self.arc))
-        lane_command = steer(self.ground, self.lane, self.arc, self.forward, xy, yaw, self.speed)
-        self.command = torch.where(self.flat[:, None], self.command, lane_command)
-        ref = self.control.refer(self.command, self.ground.map, self.first)
+        self._drive()
+        ref = self.control.refer(self.command, self.heights, self.first)
         rows, swing = torch.arange(self.num_envs), (ref.side > 0).long()
         sole = ref.sole[rows, swing]
         begin = self.first | (ref.phase == 0)
@@ -359,7 +341,7 @@ class LocomotionEnv(VecEnv):
         )  # fmt: skip
         side = self.control.reference.side
         privileged = reflect(privileged, PRIVILEGED_MIRROR, side)
-        policy = self.control.observe(self.command, self.ground.map)
+        policy = self.control.observe(self.command, self.heights)
         return TensorDict({"policy": policy, "privileged": privileged}, batch_size=[self.num_envs])
 
     def rewards(self) -> dict[str, Tensor]:
@@ -397,19 +379,14 @@ class LocomotionEnv(VecEnv):
         now = torch.cat([turn_xy(self.robots.com_velocity[:, :2], -yaw), self.robots.spin[:, 2:]], dim=1)
         self.average = self.average + (now - self.average) * (self.dt / 0.4)
 
-        fell = self.fallen()
-        away = (self.robots.pelvis[:, :2] - self.ground.at(self.lane, self.arc)).norm(dim=1)
-        fell = fell | (~self.flat & (away > 1.0))
-        left = torch.where(self.forward > 0, self.ground.length[self.lane] - self.arc, self.arc)
-        arrived = ~self.flat & (left < 0.35) & ~fell
+        fell, over = self._judge(self.fallen())
         late = self.episode_length_buf >= self.max_episode_length
-        done = fell | arrived | late
+        done = fell | over | late
 
         ids = done.nonzero()[:, 0]
-        log = {"/fell": fell.float().mean().item() / self.dt} | self._promote(ids, fell, arrived)
+        log = {"/fell": fell.float().mean().item() / self.dt} | self._finish(ids, fell, over)
         self._place(ids)
-        flat = (self.flat & ~done & (self.episode_length_buf % round(t.resample / self.dt) == 0)).nonzero()[:, 0]
-        self._new_commands(flat)
+        self._renew(done)
         chance = self._uniform(0.0, 1.0)
         pushed = ((chance < self.dt / t.push_interval) & (self.episode_length_buf > 25)).nonzero()[:, 0]
         self.robots.push(pushed, self._uniform(-t.push, t.push, 2 * len(pushed)).reshape(-1, 2))
@@ -420,10 +397,109 @@ class LocomotionEnv(VecEnv):
         # A robot that has just been placed says nothing about the step that ended its last episode.
         self._reward = torch.where(done, self._reward, reward)
         log |= {f"/reward/{name}": term.mean().item() for name, term in terms.items()}
-        extras = {"time_outs": (late | arrived) & ~fell, "log": log}
+        extras = {"time_outs": (late | over) & ~fell, "log": log}
         return self.get_observations(), self._reward - self.spec.reward.fall * fell, done, extras
 
-    def _promote(self, ids: Tensor, fell: Tensor, arrived: Tensor) -> dict[str, float]:
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides the future of the run."""
+        return {
+            "robots": self.robots.state_dict(), "control": self.control.state_dict(),
+            "random": self.random.get_state(),
+            "last": {k: v.clone() for k, v in self._last.items()},
+        } | {name: getattr(self, name).clone() for name in self.STATE}  # fmt: skip
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        state = dict(state)
+        self.robots.load_state_dict(state.pop("robots"))
+        self.control.load_state_dict(state.pop("control"))
+        self.random.set_state(state.pop("random"))
+        self._last = {k: v.clone() for k, v in state.pop("last").items()}
+        for name, value in state.items():
+            setattr(self, name, value.clone())
+
+
+class LocomotionEnv(WalkingEnv):
+    """Robots on the lanes of a `Ground`, each kind of terrain with its own robots and levels.
+
+    A robot on a lane walks it from a level place to the end under `steer`; it moves up a level when it has
+    covered most of the way in good time and down when it falls early. Distance counts along the lane's path only.
+    """
+
+    STATE = (*WalkingEnv.STATE, "level", "tried", "lane", "arc", "start", "forward", "speed")
+
+    def __init__(self, spec: LocomotionSpec, lanes: list[Lane], *, threads: int = 0) -> None:
+        t, n = spec.task, spec.task.robots
+        self.ground = Ground(lanes)
+        robots = Humanoids(spec.robot, self.ground.boxes, n, threads=threads)
+        super().__init__(spec, robots, self.ground.map, spec.seed)
+        self.kinds = list(t.shares)
+        self._by_kind = [[i for i, lane in enumerate(lanes) if lane.kind == kind] for kind in self.kinds]
+        edges = np.round(np.cumsum([0.0, *t.shares.values()]) / sum(t.shares.values()) * t.robots).astype(int)
+        self.kind = torch.zeros(t.robots, dtype=torch.long)
+        for k, (a, b) in enumerate(pairwise(edges)):
+            self.kind[a:b] = k
+        self.flat = self.kind == self.kinds.index("flat")
+        self._top = torch.tensor([len(group) - 1 for group in self._by_kind])[self.kind]
+        self._lane_table = torch.tensor([g + [g[-1]] * (max(map(len, self._by_kind)) - len(g)) for g in self._by_kind])
+
+        self.level = torch.zeros(n, dtype=torch.long)
+        self.tried = torch.zeros(n, dtype=torch.long)
+        self.lane = torch.zeros(n, dtype=torch.long)
+        self.arc, self.start, self.forward, self.speed = (
+            torch.zeros(n),
+            torch.zeros(n),
+            torch.ones(n),
+            torch.zeros(n),
+        )
+        self._begin()
+
+    def _start(self, ids: Tensor) -> tuple[Tensor, Tensor]:
+        k = len(ids)
+        t, g = self.spec.task, self.ground
+        any_level = (self._uniform(0.0, 1.0, k) * (self._top[ids] + 1)).long()
+        own = self._uniform(0.0, 1.0, k) >= t.explore
+        self.tried[ids] = torch.where(own, self.level[ids], any_level)
+        self.lane[ids] = self._lane_table[self.kind[ids], self.tried[ids]]
+        lane = self.lane[ids]
+        pick = (self._uniform(0.0, 1.0, k) * g.spawn.shape[1]).long()
+        arc = g.spawn[lane].gather(1, pick[:, None])[:, 0] + self._uniform(-0.4, 0.4, k)
+        coin = torch.where(self._uniform(0.0, 1.0, k) < 0.5, -1.0, 1.0)
+        ends = torch.where(arc < 1.3, 1.0, torch.where(arc > g.length[lane] - 1.3, -1.0, coin))
+        self.forward[ids] = torch.where(self.flat[ids], 1.0, ends)
+        self.arc[ids] = self.start[ids] = arc
+        self.speed[ids] = self._uniform(*t.lane_speed, k)
+        self.command[ids] = 0.0
+        flat = ids[self.flat[ids]]
+        self.command[flat] = self._draw_commands(len(flat))
+        self.command[ids, 0] = torch.where(self.flat[ids], self.command[ids, 0], self.speed[ids])
+        at, ahead = g.at(lane, arc), g.at(lane, arc + 0.1 * self.forward[ids])
+        to = ahead - at
+        heading = torch.atan2(to[:, 1], to[:, 0]) + self._uniform(-0.2, 0.2, k)
+        heading = torch.where(self.flat[ids], self._uniform(-torch.pi, torch.pi, k), heading)
+        at = at + self._uniform(-0.2, 0.2, 2 * k).reshape(k, 2) * torch.tensor([0.0, 1.0])
+        z = g.map(at, torch.full((k,), 9.0))
+        return torch.cat([at, z[:, None]], 1), heading
+
+    def _drive(self) -> None:
+        yaw = heading_of(self.robots.orientation)
+        xy = self.robots.pelvis[:, :2]
+        self.arc = torch.where(self.flat, self.arc, self.ground.project(self.lane, xy, self.arc))
+        lane_command = steer(self.ground, self.lane, self.arc, self.forward, xy, yaw, self.speed)
+        self.command = torch.where(self.flat[:, None], self.command, lane_command)
+
+    def _judge(self, fell: Tensor) -> tuple[Tensor, Tensor]:
+        away = (self.robots.pelvis[:, :2] - self.ground.at(self.lane, self.arc)).norm(dim=1)
+        fell = fell | (~self.flat & (away > 1.0))
+        left = torch.where(self.forward > 0, self.ground.length[self.lane] - self.arc, self.arc)
+        return fell, ~self.flat & (left < 0.35) & ~fell
+
+    def _renew(self, done: Tensor) -> None:
+        due = self.episode_length_buf % round(self.spec.task.resample / self.dt) == 0
+        flat = (self.flat & ~done & due).nonzero()[:, 0]
+        self.command[flat] = self._draw_commands(len(flat))
+
+    def _finish(self, ids: Tensor, fell: Tensor, over: Tensor) -> dict[str, float]:
         """Move levels by what the finished episodes covered along their paths."""
         log = {}
         covered = (self.arc - self.start).abs()[ids]
@@ -441,46 +517,13 @@ class LocomotionEnv(VecEnv):
             mine = self.kind[ids] == k
             log[f"/level/{kind}"] = self.level[self.kind == k].float().mean().item()
             log[f"/ended/{kind}"] = int(mine.sum())
-            log[f"/arrived/{kind}"] = int((arrived[ids] & mine).sum())
+            log[f"/arrived/{kind}"] = int((over[ids] & mine).sum())
             log[f"/fallen/{kind}"] = int((fell[ids] & mine).sum())
         return log
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that decides the future of the run."""
-        names = (
-            "level",
-            "tried",
-            "lane",
-            "arc",
-            "start",
-            "forward",
-            "speed",
-            "command",
-            "episode_length_buf",
-            "average",
-            "value",
-            "_slope",
-            "_reward",
-            "first",
-        )
-        return {
-            "robots": self.robots.state_dict(), "control": self.control.state_dict(),
-            "random": self.random.get_state(),
-            "last": {k: v.clone() for k, v in self._last.items()},
-        } | {name: getattr(self, name).clone() for name in names}  # fmt: skip
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        state = dict(state)
-        self.robots.load_state_dict(state.pop("robots"))
-        self.control.load_state_dict(state.pop("control"))
-        self.random.set_state(state.pop("random"))
-        self._last = {k: v.clone() for k, v in state.pop("last").items()}
-        for name, value in state.items():
-            setattr(self, name, value.clone())
-
 
 def has_fallen(robots: Robots) -> Tensor:
-    """(n,) pelvis less than 0.42 m over the lower foot, or tipped by more than about 55 degrees."""
-    low = robots.pelvis[:, 2] - robots.ankle[..., 2].amin(1) < 0.42
-    return low | (robots.orientation[:, 2, 2] < 0.57)
+    """(n,) pelvis less than 0.42 m over the lower foot, or tipped by more than about 55 degrees; or lost."""
+    up = robots.pelvis[:, 2] - robots.ankle[..., 2].amin(1) >= 0.42
+    finite = robots.joint_velocity.isfinite().all(1) & robots.velocity.isfinite().all(1)
+    return ~(up & (robots.orientation[:, 2, 2] >= 0.57) & finite) | robots.lost

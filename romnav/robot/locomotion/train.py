@@ -6,11 +6,12 @@ import csv
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -18,11 +19,56 @@ from torch import Tensor
 
 from romnav.errors import RomnavError
 from romnav.progress import Progress
-from romnav.robot.locomotion.task import LocomotionEnv
+from romnav.robot.locomotion.task import LocomotionEnv, WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
+from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.spec import LocomotionSpec, PpoSpec
+from romnav.world.world import build
 
 GROUPS = {"actor": ["policy"], "critic": ["policy", "privileged"]}
+
+
+class Together(VecEnv):
+    """Robots on lanes and, from some iteration on, on tiles, as one batch."""
+
+    def __init__(self, lanes: LocomotionEnv, tiles: TileEnv | None = None) -> None:
+        self.parts: list[WalkingEnv] = [lanes, *([tiles] if tiles else [])]
+        self.cfg, self.num_actions, self.device = lanes.cfg, lanes.num_actions, "cpu"
+        self.max_episode_length = lanes.max_episode_length
+        self._counts = [part.num_envs for part in self.parts]
+        self.num_envs = sum(self._counts)
+
+    def get_observations(self) -> TensorDict:
+        """Observation groups of all robots."""
+        return cast(TensorDict, torch.cat([part.get_observations() for part in self.parts]))
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """One control step of all robots; what is logged of those on tiles is called so."""
+        steps = [part.step(action) for part, action in zip(self.parts, actions.split(self._counts), strict=True)]
+        obs, reward, done, extras = zip(*steps, strict=True)
+        log = dict(extras[0]["log"])
+        for extra in extras[1:]:
+            log |= {f"/tiles{key}": value for key, value in extra["log"].items()}
+        time_outs = torch.cat([extra["time_outs"] for extra in extras])
+        return (
+            cast(TensorDict, torch.cat(obs)),
+            torch.cat(reward),
+            torch.cat(done),
+            {"time_outs": time_outs, "log": log},
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides the future of the run."""
+        lanes, *tiles = (part.state_dict() for part in self.parts)
+        return lanes | {"tiles": tiles[0]} if tiles else lanes
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`; where it knows of no robots on tiles, those begin."""
+        state = dict(state)
+        tiles = state.pop("tiles", None)
+        self.parts[0].load_state_dict(state)
+        if tiles and self.parts[1:]:
+            self.parts[1].load_state_dict(tiles)
 
 
 def make_actor(spec: PpoSpec, obs: TensorDict, actions: int) -> MLPModel:
@@ -39,7 +85,7 @@ def make_actor(spec: PpoSpec, obs: TensorDict, actions: int) -> MLPModel:
     return actor
 
 
-def make_ppo(spec: PpoSpec, env: LocomotionEnv) -> PPO:
+def make_ppo(spec: PpoSpec, env: VecEnv) -> PPO:
     """rsl-rl's PPO; `adapt` sets the learning rate.
 
     The value loss is not clipped: rsl-rl clips it at 0.2 in the units of the returns, which are near 30.
@@ -108,8 +154,7 @@ def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor],
 def training_cost(path: Path) -> dict[str, Any]:
     """Iterations, policy steps and hours that a checkpoint cost."""
     saved = torch.load(path, map_location="cpu", weights_only=False)
-    spec = saved["spec"]
-    steps = saved["iteration"] * spec["ppo"]["steps"] * spec["task"]["robots"]
+    steps = LocomotionSpec.model_validate(saved["spec"], strict=False).steps(saved["iteration"])
     return {"iterations": saved["iteration"], "steps": steps, "hours": round(saved["seconds"] / 3600, 3)}
 
 
@@ -118,7 +163,7 @@ def _save(
     spec: LocomotionSpec,
     ppo: PPO,
     average: dict[str, Tensor],
-    env: LocomotionEnv,
+    env: Together,
     iteration: int,
     seconds: float,
 ) -> None:
@@ -141,6 +186,7 @@ def train(
     progress: Progress | None = None,
     threads: int = 0,
     save_every: float = 60.0,
+    worlds: Path | None = None,
 ) -> Path:
     """Train a policy; writes `out/policy.pt` and a row per iteration to `out/curve.csv`.
 
@@ -152,35 +198,46 @@ def train(
         progress: told the iteration, their number, and reward per step and falls per second of a robot.
         threads: of the physics; 0 means all cores. They do not change the result.
         save_every: seconds between checkpoints.
+        worlds: cache of worlds, see `romnav.world.world.build`.
 
     Returns:
         The checkpoint.
 
     Raises:
-        RomnavError: the checkpoint there was trained by another specification, or `device` is not supported.
+        RomnavError: the checkpoint there was trained by another specification, `device` is not supported, or a loss,
+            reward, observation or weight is not finite; the last checkpoint is then the last good one.
     """
     if device != "cpu":
         raise RomnavError(f"train locomotion: device {device!r} has no physics engine here; use --device cpu")
     out.mkdir(parents=True, exist_ok=True)
     path = out / "policy.pt"
     torch.manual_seed(spec.seed)
-    env = LocomotionEnv(spec, curriculum(np.random.default_rng(spec.seed)), threads=threads)
+    lanes = LocomotionEnv(spec, curriculum(np.random.default_rng(spec.seed)), threads=threads)
+    saved = torch.load(path, weights_only=False) if resume and path.exists() else None
+    if saved and not _leads_to(saved, spec):
+        raise RomnavError(f"{path}: trained by another specification; use another directory or --no-resume")
+    done, spent = (saved["iteration"], saved["seconds"]) if saved else (0, 0.0)
+
+    def joined() -> Together:
+        world = build(spec.tiles.world, worlds)
+        return Together(lanes, TileEnv(spec, world, threads=threads))
+
+    env = joined() if spec.tiles.robots and done >= spec.tiles.begin else Together(lanes)
     ppo = make_ppo(spec.ppo, env)
     average = {name: weight.detach().clone() for name, weight in ppo.actor.named_parameters()}
-    done, spent = 0, 0.0
-    if resume and path.exists():
-        saved = torch.load(path, weights_only=False)
-        if {**saved["spec"], "iterations": 0} != {**spec.model_dump(), "iterations": 0}:
-            raise RomnavError(f"{path}: trained by another specification; use another directory or --no-resume")
+    if saved:
         ppo.load(saved["ppo"], None, strict=True)
         ppo.learning_rate, average = saved["learning_rate"], saved["average"]
         env.load_state_dict(saved["env"])
         torch.set_rng_state(saved["torch_random"])
-        done, spent = saved["iteration"], saved["seconds"]
     ppo.train_mode()
     obs = env.get_observations()
     begin = mark = time.monotonic()
     for iteration in range(done + 1, spec.iterations + 1):
+        if spec.tiles.robots and iteration == spec.tiles.begin + 1 and len(env.parts) == 1:
+            env = joined()
+            obs = env.get_observations()
+            ppo.storage = RolloutStorage("rl", env.num_envs, spec.ppo.steps, obs, [env.num_actions])
         rows: list[dict[str, float]] = []
         total, clock = 0.0, time.monotonic()
         with torch.inference_mode():
@@ -191,16 +248,22 @@ def train(
                 total += reward.mean().item()
             ppo.compute_returns(obs)
         collected = time.monotonic()
-        losses = ppo.update()
+        try:
+            losses = ppo.update()
+        except (RuntimeError, ValueError) as error:
+            # distributions refuse parameters that are not finite, before any loss is reported
+            _check_finite(path, iteration, {"reward": total}, ppo)
+            raise error
         losses["kl"] = adapt(ppo, spec.ppo)
         for name, weight in ppo.actor.named_parameters():
             average[name].lerp_(weight.detach(), 1.0 - spec.ppo.average)
         row = _row(rows) | {
-            "iteration": iteration, "steps": iteration * spec.ppo.steps * env.num_envs,
+            "iteration": iteration, "steps": spec.steps(iteration),
             "seconds": spent + time.monotonic() - begin, "collect": collected - clock,
             "learn": time.monotonic() - collected, "reward": total / spec.ppo.steps,
             "std": ppo.actor.distribution.std_param.mean().item(), "learning_rate": ppo.learning_rate,
         } | losses  # fmt: skip
+        _check_finite(path, iteration, row, ppo)
         _append(out / "curve.csv", row, fresh=iteration == 1)
         if progress:
             progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
@@ -210,26 +273,55 @@ def train(
     return path
 
 
+def _leads_to(saved: dict[str, Any], spec: LocomotionSpec) -> bool:
+    """Whether a run of `spec` passes through a checkpoint: without robots on tiles as long as it has none."""
+    then = LocomotionSpec.model_validate(saved["spec"], strict=False)
+    now = spec.model_copy(update={"iterations": then.iterations})
+    if saved["iteration"] <= spec.tiles.begin and (then.tiles.robots == 0 or saved["iteration"] <= then.tiles.begin):
+        now = now.model_copy(update={"tiles": then.tiles})
+    return now == then
+
+
+def _check_finite(path: Path, iteration: int, row: dict[str, float], ppo: PPO) -> None:
+    wrong = [name for name, value in row.items() if not np.isfinite(value)]
+    for owner, model in (("actor", ppo.actor), ("critic", ppo.critic)):
+        state = model.state_dict()
+        wrong += [f"{owner} {name}" for name, value in state.items() if not bool(value.isfinite().all())]
+    if wrong:
+        raise RomnavError(
+            f"{path}: iteration {iteration}: {', '.join(wrong[:3])} not finite; the checkpoint is of one before. "
+            "Lower ppo.learning_rate, or look at the settings"
+        )
+
+
 def _row(rows: list[dict[str, float]]) -> dict[str, float]:
     """Counts are summed, everything else is averaged, over the steps of an iteration."""
-    counts = ("/ended", "/arrived", "/fallen")
+    counts = ("/ended/", "/arrived/", "/fallen/")
     table: dict[str, list[float]] = {}
     for row in rows:
         for key, value in row.items():
             table.setdefault(key, []).append(value)
     return {
-        key.removeprefix("/"): float(sum(values) if key.startswith(counts) else np.mean(values))
+        key.removeprefix("/"): float(sum(values) if any(part in key for part in counts) else np.mean(values))
         for key, values in table.items()
     }
 
 
 def _append(path: Path, row: dict[str, float], *, fresh: bool) -> None:
-    columns = list(row)
+    """Add a row; columns that the file does not have yet are added, with zeros above."""
+    before: list[dict[str, Any]] = []
     if not fresh and path.exists():
-        with path.open() as file:
-            columns = file.readline().strip().split(",")
-    with path.open("w" if fresh else "a", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval=0, extrasaction="ignore")
-        if fresh or file.tell() == 0:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            columns = list(reader.fieldnames or [])
+            before = list(reader) if set(row) - set(columns) else []
+    else:
+        columns = []
+    new = not columns or bool(before)
+    columns += [name for name in row if name not in columns]
+    with path.open("w" if new else "a", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval=0)
+        if new:
             writer.writeheader()
+            writer.writerows(before)
         writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})

@@ -13,8 +13,11 @@ from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
 from romnav.robot.locomotion.lip import turn_xy
 from romnav.robot.locomotion.task import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR, LocomotionEnv
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
+from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import load_policy, train
-from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
+from romnav.world.spec import WorldSpec
+from romnav.world.world import build
 
 SHARES = {"flat": 0.5, "stairs": 0.5}
 SPEC = LocomotionSpec(
@@ -75,21 +78,21 @@ def test_levels_follow_the_distance_along_the_path() -> None:
     env.start[ids], env.arc[ids], env.speed[ids] = 0.8, 3.8, 0.5
     env.episode_length_buf[ids] = 300
     env.level[ids] = env.tried[ids] = 0
-    env._promote(ids, torch.zeros(8, dtype=torch.bool), stair)
+    env._finish(ids, torch.zeros(8, dtype=torch.bool), stair)
     assert (env.level[ids] == 1).all()
     env.level[ids] = 0
     env.episode_length_buf[ids] = 900
-    env._promote(ids, torch.zeros(8, dtype=torch.bool), stair)
+    env._finish(ids, torch.zeros(8, dtype=torch.bool), stair)
     assert (env.level[ids] == 0).all(), "arriving late does not count"
     env.level[ids] = env.tried[ids] = 1
-    env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
+    env._finish(ids, stair, torch.zeros(8, dtype=torch.bool))
     assert (env.level[ids] == 1).all(), "a fall after most of the way is no reason to go down"
     env.arc[ids] = 1.6
     env.tried[ids] = 0
-    env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
+    env._finish(ids, stair, torch.zeros(8, dtype=torch.bool))
     assert (env.level[ids] == 1).all(), "what happens on another level says nothing about this one"
     env.tried[ids] = 1
-    env._promote(ids, stair, torch.zeros(8, dtype=torch.bool))
+    env._finish(ids, stair, torch.zeros(8, dtype=torch.bool))
     assert (env.level[ids] == 0).all()
 
 
@@ -121,6 +124,59 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
         train(SPEC.model_copy(update={"seed": 9}), tmp_path / "parts", threads=1)
     with pytest.raises(RomnavError, match="no locomotion policy"):
         load_policy(tmp_path / "none.pt")
+
+
+def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Path) -> None:
+    """Across the iteration at which they join, from a checkpoint of the specification without them, and after it."""
+    world = WorldSpec(tiles=2, goals_per_tile=4, classes=("building", "outdoor"))
+    spec = SPEC.model_copy(update={"tiles": TileTaskSpec(robots=4, begin=1, world=world), "iterations": 3})
+    whole = train(spec, tmp_path / "whole", threads=1, worlds=tmp_path)
+    train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
+    train(spec.model_copy(update={"iterations": 2}), tmp_path / "parts", threads=1, worlds=tmp_path)
+    parts = train(spec, tmp_path / "parts", threads=2, worlds=tmp_path)
+    a, b = (torch.load(path, weights_only=False) for path in (whole, parts))
+    for key, value in a["ppo"]["actor_state_dict"].items():
+        assert torch.equal(value, b["ppo"]["actor_state_dict"][key]), key
+    for part in (lambda env: env, lambda env: env["tiles"]):
+        assert np.array_equal(part(a["env"])["robots"]["qpos"], part(b["env"])["robots"]["qpos"])
+    assert torch.equal(a["env"]["tiles"]["command"], b["env"]["tiles"]["command"])
+    lines = [line.split(",") for line in (tmp_path / "parts" / "curve.csv").read_text().splitlines()]
+    assert len(lines) == 4
+    assert len({len(line) for line in lines}) == 1
+    assert spec.steps(3) == 6 * (3 * 8 + 2 * 4)
+    with pytest.raises(RomnavError, match="another specification"):
+        train(SPEC.model_copy(update={"iterations": 4}), tmp_path / "parts", threads=1)
+
+
+def test_commands_on_tiles_are_held_and_within_the_limits(tmp_path: Path) -> None:
+    world = build(WorldSpec(tiles=2, goals_per_tile=4, classes=("building", "outdoor")), tmp_path)
+    spec = SPEC.model_copy(
+        update={"tiles": TileTaskSpec(robots=12, drivers={"steps": 1.0, "smooth": 1.0, "oracle": 1.0})}
+    )
+    env = TileEnv(spec, world, threads=1)
+    t, kept = spec.task, env.command.clone()
+    for _ in range(60):
+        env.step(torch.zeros(12, 15))
+        changed = (env.command != kept).any(1)
+        assert not (changed & (env.episode_length_buf % 10 != 0)).any()
+        kept = env.command.clone()
+        assert (kept[:, 0] >= t.forward[0]).all()
+        assert (kept[:, 0] <= t.forward[1]).all()
+        assert (kept[:, 1:].abs() <= torch.tensor([t.lateral, t.turn])).all()
+
+
+def test_a_state_that_is_not_finite_counts_as_a_fall() -> None:
+    env = LocomotionEnv(SPEC, lanes(), threads=1)
+    assert not env.fallen().any()
+    env.robots.joint_velocity[3, 2] = torch.nan
+    assert env.fallen().nonzero().tolist() == [[3]]
+
+
+def test_training_stops_at_what_is_not_finite(tmp_path: Path) -> None:
+    broken = SPEC.model_copy(update={"ppo": SPEC.ppo.model_copy(update={"gamma": float("nan")})})
+    with pytest.raises(RomnavError, match=r"iteration 1: .* not finite"):
+        train(broken, tmp_path, threads=1, save_every=0.0)
+    assert not list(tmp_path.glob("*.pt"))
 
 
 def test_the_policy_that_is_used_has_the_weights_averaged_over_iterations(tmp_path: Path) -> None:
