@@ -515,7 +515,8 @@ class LocomotionEnv(WalkingEnv):
         self.level[ids] = torch.where(level > top, wander, level.clamp(min=0))
         for k, kind in enumerate(self.kinds):
             mine = self.kind[ids] == k
-            log[f"/level/{kind}"] = self.level[self.kind == k].float().mean().item()
+            of_kind = self.level[self.kind == k]
+            log[f"/level/{kind}"] = of_kind.float().mean().item() if len(of_kind) else 0.0
             log[f"/ended/{kind}"] = int(mine.sum())
             log[f"/arrived/{kind}"] = int((over[ids] & mine).sum())
             log[f"/fallen/{kind}"] = int((fell[ids] & mine).sum())
