@@ -286,6 +286,7 @@ def tables(
 def episodes(
     ctx: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the new set, a file under experiments/episodes/.")],
+    seed: Annotated[int, typer.Option(help="Seed of terrain and draw.", min=1)] = 3000,
 ) -> None:
     """Draw a new set of paired episodes; existing ones are never replaced."""
     from romnav.evaluation import episodes
@@ -296,7 +297,8 @@ def episodes(
     path = Project.here(ctx.obj).root / "experiments" / "episodes" / f"{name}.json"
     if path.exists():
         raise RomnavError(f"{path}: exists, and results refer to it; choose another name")
-    spec = EpisodeSetSpec()
+    spec = EpisodeSetSpec(seed=seed)
+    spec = spec.model_copy(update={"world": spec.world.model_copy(update={"seed": seed})})
     drawn = episodes.draw(name, spec, build(spec.world))
     episodes.save(path, drawn)
     typer.echo(f"{path}: {len(drawn)} episodes, {drawn.cross.mean():.0%} across levels, hash {drawn.digest}")

@@ -22,7 +22,8 @@ from romnav.world.spec import WorldSpec
 from romnav.world.world import World, build
 
 VERSION = 1
-ATTEMPTS = 20
+CANDIDATES = 16
+"""Draws per episode of a set."""
 COLUMNS = (
     ("tile", 0),
     ("layer", 0),
@@ -82,19 +83,30 @@ class EpisodeSet:
 
 
 def draw(name: str, spec: EpisodeSetSpec, world: World) -> EpisodeSet:
-    """Draw a set on ``world``, built from ``spec.world``: tiles in turn, the sampler's spawns and goals."""
-    episode = torch.arange(spec.episodes)
-    tile = episode % len(world.tiles)
-    attempt = torch.zeros_like(episode)
-    # a spawn may have no goal within the cap: draw it again until it has
-    for _ in range(ATTEMPTS):
-        start = sample(world, spec.sampler, spec.seed, tile, episode, attempt)
-        spawn_node = world.node_at(start.tile, start.layer, start.xy)
-        offset = world.field_start[start.goal] + spawn_node - world.node_start[start.tile]
-        beyond = world.fields[offset].to(torch.float64) * UNIT > spec.sampler.max_distance
-        attempt += beyond
-    if beyond.any():
-        raise RomnavError(f"{name}: a tile has no goal within {spec.sampler.max_distance} m; raise goals_per_tile")
+    """Draw a set on ``world``, built from ``spec.world``: tiles in turn, the sampler's spawns and goals.
+
+    Of the draws that start off stairs, ramps and their mouths, with a goal within the cap, the first ``spec.cross``
+    across levels and the first others on one level are taken, in the order in which they were drawn.
+
+    Raises:
+        RomnavError: Too few draws qualify.
+    """
+    candidate = torch.arange(CANDIDATES * spec.episodes)
+    tile = candidate % len(world.tiles)
+    start = sample(world, spec.sampler, spec.seed, tile, candidate, torch.zeros_like(candidate))
+    node = world.node_at(start.tile, start.layer, start.xy)
+    offset = world.field_start[start.goal] + node - world.node_start[start.tile]
+    geodesic = world.fields[offset].to(torch.float64) * UNIT
+    fits = ~torch.isin(node, world.spawn) & (geodesic <= spec.sampler.max_distance)
+    cross = is_cross_level(world.position[node, 2], world.position[world.goal[start.goal], 2])
+    strata = [(fits & cross, spec.cross), (fits & ~cross, spec.episodes - spec.cross)]
+    if any(int(stratum.sum()) < count for stratum, count in strata):
+        raise RomnavError(
+            f"{name}: of {len(candidate)} draws {int(strata[0][0].sum())} across levels and "
+            f"{int(strata[1][0].sum())} on one level qualify; lower 'episodes' or 'cross', or raise goals_per_tile"
+        )
+    taken = torch.cat([stratum.nonzero()[:count, 0] for stratum, count in strata]).sort().values
+    start = Start(**{key: value[taken] for key, value in vars(start).items()})
     goal = world.position[world.goal[start.goal]]
     values = {
         "tile": start.tile,
@@ -108,7 +120,7 @@ def draw(name: str, spec: EpisodeSetSpec, world: World) -> EpisodeSet:
         "goal_y": goal[:, 1],
         "goal_z": goal[:, 2],
         "goal_yaw": start.goal_yaw,
-        "geodesic": world.fields[offset].to(torch.float64) * UNIT,
+        "geodesic": geodesic[taken],
     }
     columns = {
         key: values[key].numpy() if decimals == 0 else np.round(values[key].numpy().astype(np.float64), decimals)

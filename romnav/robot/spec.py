@@ -186,8 +186,8 @@ class TileTaskSpec(Config):
     """Robots on tiles, besides those on lanes."""
     begin: int = 0
     """Iterations before they join: until then the run is one without them."""
-    world: WorldSpec = WorldSpec(tiles=48, goals_per_tile=32, classes=("building", "outdoor", "building"))
-    """The tiles; classes without stairs teach little that lanes do not."""
+    world: WorldSpec = WorldSpec(tiles=48, side=20.0, goals_per_tile=32, classes=("building", "outdoor", "building"))
+    """The tiles, small: walking needs no long ways, and classes without stairs teach little that lanes do not."""
     drivers: dict[str, float] = Field(default={"steps": 0.15, "smooth": 0.15, "oracle": 0.7})
     """Share of the episodes under commands that are drawn over the whole limits and held, under such that wander
     through them, and under the shortest path to a goal."""

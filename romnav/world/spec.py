@@ -29,8 +29,8 @@ class WorldSpec(Config):
     """Number of tiles; classes take turns."""
     seed: int = 0
     """Seed of the generator; evaluation uses another one (P)."""
-    side: float = 20.0
-    """Tile side, m (A)."""
+    side: float = 40.0
+    """Tile side, m (A: beyond the paper's cap of 30 m, so that the caps differ and stairs are to be searched for)."""
     classes: tuple[str, ...] = ("building", "outdoor", "building", "room")
     """Tile classes in turn (A: half of the tiles are multi-story, where the paper's question lies)."""
     riser: tuple[float, float] = (0.10, 0.18)

@@ -98,9 +98,9 @@ class World:
 def build(spec: WorldSpec, cache: Path | None = None, progress: Callable[[int, int, str], None] | None = None) -> World:
     """Generate the tiles of ``spec``, choose their goals and compute every goal's geodesic field.
 
-    Goals are drawn uniformly over the free cells off stairs and ramps, half of the draws per floor rather than per
-    cell so that small levels are goals too. ``cache`` is a folder for the finished world; a stale or torn file in it
-    is made anew.
+    Goals are drawn uniformly over the free cells of floors, off stairs, ramps and half landings, half of the draws
+    per level rather than per cell so that small levels are goals too. ``cache`` is a folder for the finished world;
+    a stale or torn file in it is made anew.
     """
     path = cache / f"world-{_key(spec)}.pkl" if cache else None
     if path and path.exists():
@@ -116,7 +116,7 @@ def build(spec: WorldSpec, cache: Path | None = None, progress: Callable[[int, i
         tile, grid = generate(spec, i)
         tiles.append(tile)
         grids.append(grid)
-        goals.append(_draw_goals(spec, i, grid))
+        goals.append(_draw_goals(spec, tile, grid))
         if progress:
             progress(i + 1, 2 * spec.tiles, "tiles")
     world = pack(spec, tiles, grids, goals, progress)
@@ -144,9 +144,9 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def _draw_goals(spec: WorldSpec, index: int, grid: Grids) -> NDArray[np.intp]:
-    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([spec.seed, index, 0x60A1])))
-    flat = np.flatnonzero(~grid.connector)
+def _draw_goals(spec: WorldSpec, tile: Tile, grid: Grids) -> NDArray[np.intp]:
+    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([spec.seed, tile.index, 0x60A1])))
+    flat = np.flatnonzero(~grid.connector & np.isin(grid.layer, tile.storeys))
     level = np.round(grid.position[flat, 2] / LEVEL_GAP).astype(int)
     _, inverse, count = np.unique(level, return_inverse=True, return_counts=True)
     weight = 0.5 / len(flat) + 0.5 / (len(count) * count[inverse])

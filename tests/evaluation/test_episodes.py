@@ -16,6 +16,7 @@ from romnav.world.world import World, build
 SPEC = EpisodeSetSpec(
     world=WorldSpec(tiles=3, seed=41, goals_per_tile=8),
     episodes=48,
+    cross=20,
     sampler=SamplerSpec(stair_probability=0.0),
 )
 
@@ -30,6 +31,11 @@ def drawn(world: World) -> EpisodeSet:
     return episodes.draw("test", SPEC, world)
 
 
+def spawn_nodes(drawn: EpisodeSet, world: World) -> np.ndarray:
+    start = drawn.start("cpu")
+    return world.node_at(start.tile, start.layer, start.xy).numpy()
+
+
 def test_drawn_saved_and_read_are_one_set(drawn: EpisodeSet, world: World, tmp_path: Path) -> None:
     episodes.save(tmp_path / "test.json", drawn)
     read = episodes.load(tmp_path / "test.json")
@@ -37,7 +43,8 @@ def test_drawn_saved_and_read_are_one_set(drawn: EpisodeSet, world: World, tmp_p
     for key, column in drawn.columns.items():
         assert np.array_equal(column, read.columns[key])
     assert len(read) == 48
-    assert 0.2 < read.cross.mean() < 0.9
+    assert read.cross.sum() == 20
+    assert not np.isin(spawn_nodes(read, world), world.spawn.numpy()).any()
     assert (read.columns["geodesic"] <= 30.0).all()
     episodes.terrain(read, tmp_path / "test.json", None)
 
@@ -76,10 +83,13 @@ def test_goal_in_a_wall_is_found(drawn: EpisodeSet, world: World, tmp_path: Path
         episodes.terrain(wrong, tmp_path / "test.json", None)
 
 
-def test_the_shipped_set(tmp_path: Path) -> None:
-    """The paired set of the tables fits today's generator, on terrain of another seed than training."""
-    path = Path(__file__).parents[2] / "experiments" / "episodes" / "paired-1.json"
+@pytest.mark.parametrize("name", ["paired-2", "dev"])
+def test_the_shipped_sets(name: str) -> None:
+    """They fit today's generator, on terrain of other seeds than training and each other."""
+    path = Path(__file__).parents[2] / "experiments" / "episodes" / f"{name}.json"
     paired = episodes.load(path)
     assert len(paired) == 1024
-    assert paired.world.seed != WorldSpec().seed
-    episodes.terrain(paired, path, None)
+    assert paired.cross.sum() == 488
+    assert paired.world.seed == {"paired-2": 3000, "dev": 2000}[name] != WorldSpec().seed
+    world = episodes.terrain(paired, path, None)
+    assert not np.isin(spawn_nodes(paired, world), world.spawn.numpy()).any()

@@ -1,4 +1,8 @@
-"""Multi-storey buildings: a corridor between two rows of rooms on every floor, joined by stairs and ramps."""
+"""Multi-storey buildings: a corridor between two rows of rooms on every floor, joined by stairwells.
+
+Stairwells are as in real ones: some rooms apart, most behind a doorway, and not all of them on the same storeys, so
+that the way up may lead along the corridor to one staircase and back to the next.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +21,18 @@ from romnav.world.tiles.stairs import SLAB, Railing, Staircase, draw_ramp, draw_
 WALL = 0.15
 APPROACH = 1.4
 """Free depth before the mouth of a staircase, m."""
+NARROWEST = 2.6
+"""A row is not cut into pieces shorter than this, m."""
+WING, TOWER = (0.6, 1.0), (0.36, 0.56)
+"""Share of the tile's side that a building is long; shorter where one staircase joins three storeys, so that goals two
+storeys up lie within the paper's cap."""
+DEPTH = (15.0, 24.0)
+"""Depth of a building, m: rooms of up to ten metres on either side of the corridor."""
 
 
 @dataclass(frozen=True)
 class Core:
-    """A staircase in its hall: a stretch of one row of rooms, open to the corridor."""
+    """A staircase in its hall: a stretch of one row of rooms, behind a doorway or open to the corridor."""
 
     stairs: Staircase
     row: int
@@ -31,6 +42,8 @@ class Core:
     first: int
     last: int
     """Storeys that it joins."""
+    enclosed: bool
+    """Whether a wall with a doorway parts the hall from the corridor."""
 
     def touches(self, storey: int) -> bool:
         """Whether the hall is needed on ``storey``."""
@@ -74,11 +87,14 @@ def building(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
 
 
 def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
-    storeys = int(rng.integers(min(2, spec.max_storeys), spec.max_storeys + 1))
+    low = spec.max_storeys < 3 or rng.random() < 0.45
+    storeys = min(2, spec.max_storeys) if low else spec.max_storeys
+    spans = _spans(rng, storeys)
+    lengths = TOWER if (0, 2) in spans else WING
     room = spec.side - 0.6
     while True:
         yaw = float(rng.uniform(-0.35, 0.35)) if rng.random() < 0.4 else 0.0
-        length, depth = float(rng.uniform(0.72, 1.0)) * room, float(rng.uniform(0.6, 0.95)) * room
+        length, depth = float(rng.uniform(*lengths)) * room, min(float(rng.uniform(*DEPTH)), 0.95 * room)
         c, s = np.cos(yaw), abs(np.sin(yaw))
         if max(length * c + depth * s, length * s + depth * c) <= room:
             break
@@ -88,47 +104,59 @@ def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
     width = float(rng.uniform(1.8, 2.6))
     start = (depth - width) * float(rng.uniform(0.38, 0.62))
     empty = Plan(frame, length, depth, (start, start + width), (), storeys)
-    rows = [int(r) for r in rng.permutation(2)][: 1 if rng.random() < 0.4 else 2]
-    relay = len(rows) == 2 and storeys == 3 and rng.random() < 0.35
-    cores = []
-    for k, row in enumerate(rows if storeys > 1 else []):
-        first, last = ((k, k + 1) if relay else (0, storeys - 1)) if k == 0 or relay else _span(rng, storeys)
-        core = _draw_core(rng, spec, empty, row, first, last)
+    cores: list[Core] = []
+    for first, last in spans:
+        core = _draw_core(rng, spec, empty, cores, first, last)
         if core is not None:
             cores.append(core)
     return Plan(frame, length, depth, empty.corridor, tuple(cores), storeys)
 
 
-def _span(rng: np.random.Generator, storeys: int) -> tuple[int, int]:
-    first = int(rng.integers(storeys - 1))
-    return first, int(rng.integers(first + 1, storeys))
+def _spans(rng: np.random.Generator, storeys: int) -> list[tuple[int, int]]:
+    """Storeys that each staircase joins: one through all, or a relay of one per storey, and perhaps one more."""
+    if storeys == 1:
+        return []
+    relay = storeys == 3 and rng.random() < 0.4
+    spans = [(0, 1), (1, 2)] if relay else [(0, storeys - 1)]
+    if rng.random() < 0.7:
+        first = int(rng.integers(storeys - 1))
+        spans.append((first, int(rng.integers(first + 1, storeys))))
+    return spans
 
 
-def _draw_core(rng: np.random.Generator, spec: WorldSpec, plan: Plan, row: int, first: int, last: int) -> Core | None:
-    v0, v1 = plan.row(row)
-    depth, length = v1 - v0, plan.length - 2 * WALL
-    for _ in range(20):
-        kind = int(rng.choice(4, p=(0.3, 0.2, 0.25, 0.25)))
+def _draw_core(
+    rng: np.random.Generator, spec: WorldSpec, plan: Plan, others: list[Core], first: int, last: int
+) -> Core | None:
+    """A staircase from storey ``first`` to ``last`` clear of the ``others``; None where there is no room for one."""
+    length = plan.length - 2 * WALL
+    for _ in range(40):
+        row = int(rng.integers(2))
+        v0, v1 = plan.row(row)
+        depth = v1 - v0
+        kind = int(rng.choice(4, p=(0.55, 0.25, 0.12, 0.08)))
         width, half = float(rng.uniform(1.4, 1.8)), spec.storey_height / 2
-        flight = draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width)
+        flight = draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width, 1.1)
         stairs = Staircase(flight, float(rng.uniform(1.4, 1.8)), turn=kind != 2, walled=rng.random() < 0.35)
         wide, reach = 2 * stairs.half_width, stairs.length
         along = reach + APPROACH * (1 if stairs.turn else 2)
         if kind == 0:
             span = wide + float(rng.uniform(0.0, 3.0))
-            fits = depth >= reach + 0.6
+            fits = depth >= reach + APPROACH
         else:
             span = along + float(rng.uniform(0.0, 1.5))
             fits = depth >= wide
         if not fits or span > length:
             continue
         left = float(rng.choice([0.0, 1.0, rng.uniform()])) * (length - span)
-        left = 0.0 if left < 2.6 else length - span if length - span - left < 2.6 else left
+        left = 0.0 if left < NARROWEST else length - span if length - span - left < NARROWEST else left
         hall = (WALL + left, WALL + left + span)
+        if any(o.row == row and hall[0] < o.hall[1] + NARROWEST and o.hall[0] < hall[1] + NARROWEST for o in others):
+            continue
+        enclosed = rng.random() < 0.8
         if kind == 0:
             at = hall[0] + float(rng.uniform(wide / 2, span - wide / 2))
             mouth, yaw = (v1 - reach, np.pi / 2) if row else (v0 + reach, -np.pi / 2)
-            return Core(stairs, row, hall, plan.frame.sub(at, mouth, yaw), first, last)
+            return Core(stairs, row, hall, plan.frame.sub(at, mouth, yaw), first, last, enclosed)
         side = v1 - wide / 2 if row else v0 + wide / 2
         if rng.random() < 0.5 and depth > wide + 1.0:
             side = float(rng.uniform(v0 + wide / 2, v1 - wide / 2))
@@ -136,7 +164,7 @@ def _draw_core(rng: np.random.Generator, spec: WorldSpec, plan: Plan, row: int, 
             frame = plan.frame.sub(hall[0] + APPROACH, side)
         else:
             frame = plan.frame.sub(hall[1] - APPROACH, side, np.pi)
-        return Core(stairs, row, hall, frame, first, last)
+        return Core(stairs, row, hall, frame, first, last, enclosed)
     return None
 
 
@@ -178,12 +206,12 @@ def _storey(
     for u, v in rooms:
         area = (u[1] - u[0]) * (v[1] - v[0])
         at = frame.sub(u[0], v[0])
-        furnish(solids, rng, floor, at, (u[1] - u[0], v[1] - v[0]), z, ROOM, int(rng.poisson(area / 5.0)))
+        furnish(solids, rng, floor, at, (u[1] - u[0], v[1] - v[0]), z, ROOM, int(rng.poisson(area / 9.0)))
     for core in plan.cores:
         if core.touches(storey):
             v = plan.row(core.row)
             size = (core.hall[1] - core.hall[0], v[1] - v[0])
-            count = int(rng.poisson(size[0] * size[1] / 12.0))
+            count = int(rng.poisson(size[0] * size[1] / 16.0))
             furnish(solids, rng, floor, frame.sub(core.hall[0], v[0]), size, z, HALL, count)
     size = (plan.length - 2 * WALL, plan.corridor[1] - plan.corridor[0])
     furnish(solids, rng, floor, frame.sub(WALL, plan.corridor[0]), size, z, HALL, int(rng.poisson(2.0)))
@@ -259,6 +287,9 @@ def _rooms(
     for (a, b), _ in rooms:
         if rng.random() < 0.88:
             _wall(solids, rng, floor, edge.sub(a, 0.0), b - a, z, True)
+    for core in plan.cores:
+        if core.row == row and core.touches(storey) and core.enclosed:
+            _wall(solids, rng, floor, edge.sub(core.hall[0], 0.0), core.hall[1] - core.hall[0], z, True)
     return rooms
 
 

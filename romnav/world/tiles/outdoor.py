@@ -80,26 +80,27 @@ def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
 
 
 def _terraces(rng: np.random.Generator, side: float) -> list[Plot]:
-    """Plots of a recursive bisection at heights that differ by a climb or by a curb."""
-    climbs = np.cumsum([0.0, rng.uniform(0.5, 0.9), rng.uniform(0.5, 0.9), rng.uniform(0.5, 0.9)])
-    plots = _divide(rng, (0.0, side), (0.0, side))
+    """Plots of a recursive bisection at heights that differ by a storey or two, a few steps or a curb."""
+    climbs = np.cumsum([0.0, rng.uniform(0.5, 1.5), rng.uniform(2.5, 4.0), rng.uniform(0.6, 3.0)])
+    plots = _divide(rng, (0.0, side), (0.0, side), side / 3)
     for plot in plots:
-        plot.z = float(climbs[rng.choice(4, p=(0.4, 0.25, 0.2, 0.15))])
+        plot.z = float(climbs[rng.choice(4, p=(0.35, 0.2, 0.25, 0.2))])
         if rng.random() < 0.25:
             plot.z += float(rng.uniform(*CURB))
     return plots
 
 
-def _divide(rng: np.random.Generator, u: Span, v: Span) -> list[Plot]:
+def _divide(rng: np.random.Generator, u: Span, v: Span, most: float) -> list[Plot]:
+    """Plots of a rectangle, none longer than ``most`` but by a third."""
     du, dv = u[1] - u[0], v[1] - v[0]
-    if max(du, dv) < 10.5 or (max(du, dv) < 14.0 and rng.random() < 0.3):
+    if max(du, dv) < most or (max(du, dv) < 4 / 3 * most and rng.random() < 0.3):
         return [Plot(u, v)]
     at = float(rng.uniform(0.35, 0.65))
     if du > dv or (du == dv and rng.random() < 0.5):
         middle = u[0] + at * du
-        return _divide(rng, (u[0], middle), v) + _divide(rng, (middle, u[1]), v)
+        return _divide(rng, (u[0], middle), v, most) + _divide(rng, (middle, u[1]), v, most)
     middle = v[0] + at * dv
-    return _divide(rng, u, (v[0], middle)) + _divide(rng, u, (middle, v[1]))
+    return _divide(rng, u, (v[0], middle), most) + _divide(rng, u, (middle, v[1]), most)
 
 
 def _street(rng: np.random.Generator, side: float) -> list[Plot]:
@@ -122,17 +123,19 @@ def _street(rng: np.random.Generator, side: float) -> list[Plot]:
         count = int(rng.integers(1, 4))
         ends = np.linspace(0.0, side, count + 1)
         for a, b in itertools.pairwise(ends):
-            z = curb + float(rng.choice([0.0, rng.uniform(0.4, 1.0), rng.uniform(1.0, 2.3)]))
+            z = curb + float(rng.choice([0.0, rng.uniform(0.4, 1.5), rng.uniform(3.5, 4.5)], p=(0.25, 0.25, 0.5)))
             add((float(a), float(b)), (lines[k], lines[k + 1]), z, STREET)
     return plots
 
 
 def _park(rng: np.random.Generator, side: float) -> list[Plot]:
-    """One meadow, or two with a step of terrain between; podiums make the rest."""
-    if rng.random() < 0.6:
-        return [Plot((0.0, side), (0.0, side))]
-    middle = side * float(rng.uniform(0.35, 0.65))
-    return [Plot((0.0, side), (0.0, middle)), Plot((0.0, side), (middle, side), float(rng.uniform(0.4, 1.8)))]
+    """A hillside of two or three meadows, each a climb above the last; podiums make the rest."""
+    count = int(rng.integers(2, 4))
+    lines = side * (np.arange(count + 1) + np.pad(rng.uniform(-0.15, 0.15, count - 1), 1)) / count
+    rises = [float(rng.choice([rng.uniform(0.5, 2.0), rng.uniform(3.0, 4.5)], p=(0.3, 0.7))) for _ in range(count - 1)]
+    heights = np.cumsum([0.0, *rises])
+    strips = zip(itertools.pairwise(lines.tolist()), heights.tolist(), strict=True)
+    return [Plot((0.0, side), across, z) for across, z in strips]
 
 
 class _Site:
@@ -158,7 +161,7 @@ class _Site:
             if rise <= CURB[1]:
                 joined = True
             else:
-                wanted = 1 + int(self.rng.poisson(shared[1] / 14.0)) if group[low] != group[high] else 1
+                wanted = 1 + int(self.rng.poisson(shared[1] / 28.0)) if group[low] != group[high] else 1
                 joined = self.climb(*shared, plots[low].z, rise, wanted, (plots[low], plots[high])) > 0
             if joined:
                 group = [group[low] if g == group[high] else g for g in group]
@@ -183,16 +186,17 @@ class _Site:
             if len(built) == wanted:
                 break
             widest = length - 0.9
-            width = float(rng.choice([rng.uniform(1.4, 2.2), rng.uniform(2.2, 4.0), rng.uniform(4.0, 8.0)]))
+            widths = [rng.uniform(1.4, 2.2), rng.uniform(2.2, 3.5), rng.uniform(3.5, 6.0)]
+            width = float(rng.choice(widths, p=(0.4, 0.4, 0.2) if rise < 1.5 else (0.6, 0.4, 0.0)))
             if min(width, widest) < 1.4:
                 break
             width = min(width, widest)
             flight = (
-                draw_ramp(rng, rise, width, (7.0, 15.0))
-                if rng.random() < 0.45
+                draw_ramp(rng, rise, width, (7.0, 15.0) if rise < 1.5 else (11.0, 15.0))
+                if rng.random() < (0.45 if rise < 1.5 else 0.3)
                 else draw_stair(rng, self.spec, rise, width)
             )
-            inset = plots is not None and rng.random() < 0.35
+            inset = plots is not None and rng.random() < (0.35 if rise < 1.5 else 0.6)
             at = float(rng.uniform(0.4, length - width - 0.4)) + width / 2
             foot = frame.sub(at, 0.0 if inset else flight.length, -np.pi / 2)
             v = (-width / 2, width / 2)
@@ -250,7 +254,7 @@ class _Site:
         ground = ((0.0, size[0]), (0.0, size[1]))
         block(self.solids, frame, *ground, (z - 0.1, z + rise), label=Label.GROUND, layers=(0, 0))
         sides = edges(frame, size)
-        for k in rng.permutation(4)[: 0 if island else int(rng.integers(2, 5))]:
+        for k in rng.permutation(4)[: 0 if island else int(rng.integers(1, 3))]:
             side, length = sides[int(k)]
             self.climb(side, length, z, rise, 1)
         for side, length in sides:

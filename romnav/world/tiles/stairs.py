@@ -51,14 +51,15 @@ class Railing:
         return cls(spacing=float(rng.uniform(1.0, 1.8)), wires=int(rng.integers(0, 3)))
 
 
-def draw_stair(rng: np.random.Generator, spec: WorldSpec, rise: float, width: float) -> Flight:
+def draw_stair(rng: np.random.Generator, spec: WorldSpec, rise: float, width: float, gentle: float = 1.35) -> Flight:
     """A random staircase of exactly ``rise``; the last riser meets the floor.
 
-    It has two risers at least: one that is too high for a curb is split, below the range of risers if need be.
+    It has up to ``gentle`` times as many risers as it needs, and at least two: one that is too high for a curb is
+    split, below the range of risers if need be.
     """
     least = max(2, int(np.ceil(rise / spec.riser[1] - 1e-9)))
     most = int(np.floor(rise / spec.riser[0] + 1e-9))
-    steps = int(rng.integers(least, max(least, min(most, round(1.35 * least))) + 1))
+    steps = int(rng.integers(least, max(least, min(most, round(gentle * least))) + 1))
     return Flight(rise, (steps - 1) * float(rng.uniform(*spec.tread)), width, steps)
 
 
