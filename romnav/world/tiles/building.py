@@ -23,11 +23,11 @@ APPROACH = 1.4
 """Free depth before the mouth of a staircase, m."""
 NARROWEST = 2.6
 """A row is not cut into pieces shorter than this, m."""
-WING, TOWER = (0.6, 1.0), (0.36, 0.56)
-"""Share of the tile's side that a building is long; shorter where one staircase joins three storeys, so that goals two
-storeys up lie within the paper's cap."""
-DEPTH = (15.0, 24.0)
-"""Depth of a building, m: rooms of up to ten metres on either side of the corridor."""
+WING, TOWER = ((24.0, 39.0), (15.0, 24.0)), ((12.0, 17.0), (12.0, 15.5))
+"""Length and depth of a building, m: rooms of up to ten metres on either side of a corridor; a compact tower where one
+staircase joins three storeys, so that goals two storeys up lie within the paper's cap."""
+KINDS = (0.55, 0.25, 0.12, 0.08)
+"""Shares of staircases: U-turns across and along the building, straight ones, ramps; the last two join two storeys."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def building(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
 
 
 def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
-    low = spec.max_storeys < 3 or rng.random() < 0.45
+    low = spec.max_storeys < 3 or rng.random() < 0.5
     storeys = min(2, spec.max_storeys) if low else spec.max_storeys
     spans = _spans(rng, storeys)
-    lengths = TOWER if (0, 2) in spans else WING
+    lengths, depths = TOWER if (0, 2) in spans else WING
     room = spec.side - 0.6
     while True:
         yaw = float(rng.uniform(-0.35, 0.35)) if rng.random() < 0.4 else 0.0
-        length, depth = float(rng.uniform(*lengths)) * room, min(float(rng.uniform(*DEPTH)), 0.95 * room)
+        length, depth = (min(float(rng.uniform(*x)), room) for x in (lengths, depths))
         c, s = np.cos(yaw), abs(np.sin(yaw))
         if max(length * c + depth * s, length * s + depth * c) <= room:
             break
@@ -116,7 +116,7 @@ def _spans(rng: np.random.Generator, storeys: int) -> list[tuple[int, int]]:
     """Storeys that each staircase joins: one through all, or a relay of one per storey, and perhaps one more."""
     if storeys == 1:
         return []
-    relay = storeys == 3 and rng.random() < 0.4
+    relay = storeys == 3 and rng.random() < 0.3
     spans = [(0, 1), (1, 2)] if relay else [(0, storeys - 1)]
     if rng.random() < 0.7:
         first = int(rng.integers(storeys - 1))
@@ -129,11 +129,12 @@ def _draw_core(
 ) -> Core | None:
     """A staircase from storey ``first`` to ``last`` clear of the ``others``; None where there is no room for one."""
     length = plan.length - 2 * WALL
+    kinds = np.array(KINDS) * ((1, 1, 1, 1) if last - first == 1 else (1, 1, 0, 0))
     for _ in range(40):
         row = int(rng.integers(2))
         v0, v1 = plan.row(row)
         depth = v1 - v0
-        kind = int(rng.choice(4, p=(0.55, 0.25, 0.12, 0.08)))
+        kind = int(rng.choice(4, p=kinds / kinds.sum()))
         width, half = float(rng.uniform(1.4, 1.8)), spec.storey_height / 2
         flight = draw_ramp(rng, half, width, (12.5, 15.0)) if kind == 3 else draw_stair(rng, spec, half, width, 1.1)
         stairs = Staircase(flight, float(rng.uniform(1.4, 1.8)), turn=kind != 2, walled=rng.random() < 0.35)

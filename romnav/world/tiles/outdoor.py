@@ -13,10 +13,12 @@ from romnav.world.spec import WorldSpec
 from romnav.world.tile import Connector, Tile, TileClass
 from romnav.world.tiles.furniture import ROAD, STREET, Item, furnish
 from romnav.world.tiles.site import Floor, Frame, Span, block, cut, edges
-from romnav.world.tiles.stairs import MOUTH, Railing, add_flight, add_railing, draw_ramp, draw_stair
+from romnav.world.tiles.stairs import MOUTH, SLAB, Railing, add_flight, add_railing, draw_ramp, draw_stair
 
 EDGE = 0.3
 """Depth of the boundary wall, hedge or fence, m."""
+UPPER = 2.4
+"""Ground above this height belongs to the upper layer, so that a bridge may lead over the lower one, m."""
 CURB = (0.08, 0.15)
 """Heights that are stepped over, m."""
 
@@ -57,11 +59,13 @@ def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     """A fenced piece of terrain in one of three layouts, with street furniture."""
     layout: Callable[[np.random.Generator, float], list[Plot]] = (_terraces, _street, _park)[int(rng.integers(3))]
     plots = layout(rng, spec.side)
-    site = _Site(rng, spec)
+    site = _Site(rng, spec, max(plot.z for plot in plots))
+    if layout is _street:
+        site.bridge(plots)
     site.join(plots)
     for plot in plots:
         for u, v in cut((plot.u, plot.v), plot.notches):
-            block(site.solids, Frame(0.0, 0.0), u, v, (-0.2, plot.z), label=Label.GROUND, layers=(0, 0))
+            block(site.solids, Frame(0.0, 0.0), u, v, (-0.2, plot.z), label=Label.GROUND, layers=site.layers(plot.z))
         if min(plot.size) > 7.0:
             site.podiums(plot)
     site.border(plots)
@@ -73,18 +77,18 @@ def outdoor(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
         index=index,
         side=spec.side,
         solids=site.solids.build(),
-        layers=(0.0,),
-        storeys=(0,),
+        layers=site.heights,
+        storeys=tuple(range(len(site.heights))),
         connectors=tuple(site.connectors),
     )
 
 
 def _terraces(rng: np.random.Generator, side: float) -> list[Plot]:
     """Plots of a recursive bisection at heights that differ by a storey or two, a few steps or a curb."""
-    climbs = np.cumsum([0.0, rng.uniform(0.5, 1.5), rng.uniform(2.5, 4.0), rng.uniform(0.6, 3.0)])
+    climbs = np.cumsum([0.0, rng.uniform(0.5, 1.5), rng.uniform(2.8, 4.0), rng.uniform(3.5, 4.2)])
     plots = _divide(rng, (0.0, side), (0.0, side), side / 3)
     for plot in plots:
-        plot.z = float(climbs[rng.choice(4, p=(0.35, 0.2, 0.25, 0.2))])
+        plot.z = float(climbs[rng.choice(4, p=(0.3, 0.15, 0.3, 0.25))])
         if rng.random() < 0.25:
             plot.z += float(rng.uniform(*CURB))
     return plots
@@ -104,7 +108,7 @@ def _divide(rng: np.random.Generator, u: Span, v: Span, most: float) -> list[Plo
 
 
 def _street(rng: np.random.Generator, side: float) -> list[Plot]:
-    """A road between kerbed pavements, with raised gardens behind them."""
+    """A road between kerbed pavements; behind them gardens, some as high as the others that are a storey up."""
     road, walks = float(rng.uniform(4.5, 6.5)), rng.uniform(2.2, 3.4, 2)
     spare = side - road - float(walks.sum())
     first = float(rng.uniform(0.35, 0.65)) * spare
@@ -112,6 +116,7 @@ def _street(rng: np.random.Generator, side: float) -> list[Plot]:
     lines = [*(float(c) for c in cuts), side]
     curb = float(rng.uniform(*CURB))
     turned = rng.random() < 0.5
+    storey = curb + float(rng.uniform(3.5, 4.3))
     plots = []
 
     def add(along: Span, across: Span, z: float, items: tuple[Item, ...]) -> None:
@@ -123,16 +128,17 @@ def _street(rng: np.random.Generator, side: float) -> list[Plot]:
         count = int(rng.integers(1, 4))
         ends = np.linspace(0.0, side, count + 1)
         for a, b in itertools.pairwise(ends):
-            z = curb + float(rng.choice([0.0, rng.uniform(0.4, 1.5), rng.uniform(3.5, 4.5)], p=(0.25, 0.25, 0.5)))
+            z = float(rng.choice([curb, curb + rng.uniform(0.4, 1.5), storey], p=(0.2, 0.2, 0.6)))
             add((float(a), float(b)), (lines[k], lines[k + 1]), z, STREET)
     return plots
 
 
 def _park(rng: np.random.Generator, side: float) -> list[Plot]:
-    """A hillside of two or three meadows, each a climb above the last; podiums make the rest."""
-    count = int(rng.integers(2, 4))
-    lines = side * (np.arange(count + 1) + np.pad(rng.uniform(-0.15, 0.15, count - 1), 1)) / count
-    rises = [float(rng.choice([rng.uniform(0.5, 2.0), rng.uniform(3.0, 4.5)], p=(0.3, 0.7))) for _ in range(count - 1)]
+    """A hillside: two meadows with a narrower terrace between them, each a climb above the last; podiums add to it."""
+    terrace = float(rng.uniform(9.0, 12.0))
+    first = float(rng.uniform(0.4, 0.6)) * (side - terrace)
+    lines = np.array([0.0, first, first + terrace, side])
+    rises = [float(rng.choice([rng.uniform(0.5, 2.0), rng.uniform(3.6, 4.3)], p=(0.25, 0.75))) for _ in range(2)]
     heights = np.cumsum([0.0, *rises])
     strips = zip(itertools.pairwise(lines.tolist()), heights.tolist(), strict=True)
     return [Plot((0.0, side), across, z) for across, z in strips]
@@ -141,13 +147,58 @@ def _park(rng: np.random.Generator, side: float) -> list[Plot]:
 class _Site:
     """The solids, reservations and connectors of one outdoor tile under construction."""
 
-    def __init__(self, rng: np.random.Generator, spec: WorldSpec) -> None:
+    def __init__(self, rng: np.random.Generator, spec: WorldSpec, highest: float) -> None:
         self.rng, self.spec = rng, spec
+        self.heights = (0.0, 2 * UPPER) if highest > UPPER else (0.0,)
+        """Reference heights of its layers, which change half way between, at `UPPER`."""
+        self.mouths: list[tuple[float, float]] = []
+        """Middles of the ends of bridges, on edges of plots."""
         self.solids = SolidsBuilder()
         self.connectors: list[Connector] = []
         self.railing = Railing.draw(rng)
         self.floor = Floor(spec.side)
         self.floor.open(Frame(0.0, 0.0), (EDGE, spec.side - EDGE), (EDGE, spec.side - EDGE))
+
+    def layers(self, low: float, high: float | None = None) -> tuple[int, int]:
+        """First and last layer of a surface from height ``low`` to ``high``."""
+        return int(low > UPPER), int((low if high is None else high) > UPPER)
+
+    def bridge(self, plots: list[Plot]) -> None:
+        """Lead bridges over the lower ground between opposite plots of one height on the upper layer."""
+        pairs = [(a, b) for a, b in itertools.permutations([p for p in plots if p.z > UPPER], 2)]
+        for a, b in pairs:
+            across = a.v[1] < b.v[0] and a.z == b.z
+            if not across and not (a.u[1] < b.u[0] and a.z == b.z):
+                continue
+            one, other = (a.u, b.u) if across else (a.v, b.v)
+            low, high = max(one[0], other[0]) + 1.5, min(one[1], other[1]) - 1.5
+            width = float(self.rng.uniform(1.8, 2.6))
+            if high - low < width or self.rng.random() < 0.35:
+                continue
+            at = float(self.rng.uniform(low + width / 2, high - width / 2))
+            deck = Frame(at, a.v[1], np.pi / 2) if across else Frame(a.u[1], at)
+            span = b.v[0] - a.v[1] if across else b.u[0] - a.u[1]
+            half = width / 2
+            if not self.floor.fits(deck, (-1.5, span + 1.5), (-half, half)):
+                continue
+            block(
+                self.solids, deck, (0.0, span), (-half, half), (a.z - SLAB, a.z),
+                label=Label.GROUND, layers=self.layers(a.z),
+            )  # fmt: skip
+            for side in (-1, 1):
+                add_railing(self.solids, deck.sub(0.0, side * (half - 0.04)), (0.0, span), a.z, self.railing)
+            self.floor.reserve(deck, (-1.5, span + 1.5), (-half - 0.2, half + 0.2))
+            self.mouths += [deck.at(0.0, 0.0), deck.at(span, 0.0)]
+
+    def openings(self, frame: Frame, length: float) -> list[Span]:
+        """Stretches of an edge along u that a bridge opens."""
+        spans = []
+        for x, y in self.mouths:
+            c, s = np.cos(frame.yaw), np.sin(frame.yaw)
+            u, v = c * (x - frame.x) + s * (y - frame.y), c * (y - frame.y) - s * (x - frame.x)
+            if abs(v) < 1e-6 and 0.0 < u < length:
+                spans.append((float(u) - 1.4, float(u) + 1.4))
+        return spans
 
     def join(self, plots: list[Plot]) -> None:
         """Join neighbouring plots by flights along their shared edges: all that need one, and more."""
@@ -187,14 +238,14 @@ class _Site:
                 break
             widest = length - 0.9
             widths = [rng.uniform(1.4, 2.2), rng.uniform(2.2, 3.5), rng.uniform(3.5, 6.0)]
-            width = float(rng.choice(widths, p=(0.4, 0.4, 0.2) if rise < 1.5 else (0.6, 0.4, 0.0)))
+            width = float(rng.choice(widths, p=(0.5, 0.35, 0.15) if rise < 1.5 else (0.85, 0.15, 0.0)))
             if min(width, widest) < 1.4:
                 break
             width = min(width, widest)
             flight = (
-                draw_ramp(rng, rise, width, (7.0, 15.0) if rise < 1.5 else (11.0, 15.0))
-                if rng.random() < (0.45 if rise < 1.5 else 0.3)
-                else draw_stair(rng, self.spec, rise, width)
+                draw_ramp(rng, rise, width, (9.0, 15.0) if rise < 1.5 else (13.0, 15.0))
+                if rng.random() < (0.35 if rise < 1.5 else 0.15)
+                else draw_stair(rng, self.spec, rise, width, 1.35 if rise < 1.5 else 1.15)
             )
             inset = plots is not None and rng.random() < (0.35 if rise < 1.5 else 0.6)
             at = float(rng.uniform(0.4, length - width - 0.4)) + width / 2
@@ -207,11 +258,12 @@ class _Site:
                 plots[0].contains(foot, (-1.3, brink), v) and plots[1].contains(foot, (brink, flight.length + 1.3), v)
             ):
                 continue
-            add_flight(self.solids, foot, z, flight, (0, 0), base=z - 0.1)
+            layers = self.layers(z, z + rise)
+            add_flight(self.solids, foot, z, flight, layers, base=z - 0.1)
             built.append((at - width / 2, at + width / 2))
             points = [(-MOUTH, 0.0, z), (0.0, 0.0, z), (flight.length, 0.0, z + rise)]
             points.append((flight.length + MOUTH, 0.0, z + rise))
-            self.connectors.append(Connector(flight.kind, foot.path(points), width, (0, 0)))
+            self.connectors.append(Connector(flight.kind, foot.path(points), width, layers))
             guarded = rise > 0.5 and rng.random() < 0.6
             if inset and plots is not None:
                 corners = [foot.at(u, w) for u in (0.0, flight.length) for w in v]
@@ -227,10 +279,10 @@ class _Site:
             self.floor.reserve(foot, (-1.4, flight.length + 1.4), v, 0.7)
         if rng.random() < 0.6 and rise > 0.3:
             edge = 0.0
-            for start, end in [*sorted(built), (length, length)]:
+            for start, end in [*sorted(built + self.openings(frame, length)), (length, length)]:
                 if start - edge > 0.6:
                     add_railing(self.solids, frame.sub(0.0, -0.05), (edge, start), z + rise, self.railing)
-                edge = end
+                edge = max(edge, end)
         self.floor.reserve(frame, (0.0, length), (-0.8, 0.4))
         return len(built)
 
@@ -251,8 +303,10 @@ class _Site:
         rng = self.rng
         island = tier == 0 and rng.random() < 0.25
         rise = float(rng.uniform(*CURB)) if island else float(rng.uniform(0.3, 1.3))
+        if self.layers(z) != self.layers(z + rise):
+            return
         ground = ((0.0, size[0]), (0.0, size[1]))
-        block(self.solids, frame, *ground, (z - 0.1, z + rise), label=Label.GROUND, layers=(0, 0))
+        block(self.solids, frame, *ground, (z - 0.1, z + rise), label=Label.GROUND, layers=self.layers(z + rise))
         sides = edges(frame, size)
         for k in rng.permutation(4)[: 0 if island else int(rng.integers(1, 3))]:
             side, length = sides[int(k)]
