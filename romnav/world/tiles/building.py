@@ -23,9 +23,12 @@ APPROACH = 1.4
 """Free depth before the mouth of a staircase, m."""
 NARROWEST = 2.6
 """A row is not cut into pieces shorter than this, m."""
-WING, TOWER = ((24.0, 39.0), (15.0, 24.0)), ((12.0, 17.0), (12.0, 15.5))
+WING, TOWER = ((33.0, 39.4), (15.0, 24.0)), ((9.5, 12.5), (10.5, 12.5))
 """Length and depth of a building, m: rooms of up to ten metres on either side of a corridor; a compact tower where one
 staircase joins three storeys, so that goals two storeys up lie within the paper's cap."""
+HIGH, RELAY, GOLDEN = 0.46, 0.06, (5**0.5 - 1) / 2
+"""Shares of buildings with three storeys, and of those in which no staircase joins all three, spread evenly over the
+tiles by multiples of the golden section."""
 KINDS = (0.55, 0.25, 0.12, 0.08)
 """Shares of staircases: U-turns across and along the building, straight ones, ramps; the last two join two storeys."""
 
@@ -68,7 +71,7 @@ class Plan:
 
 def building(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     """A building of two to ``spec.max_storeys`` storeys."""
-    plan = _draw_plan(rng, spec)
+    plan = _draw_plan(rng, spec, index)
     solids = SolidsBuilder()
     railing = Railing.draw(rng)
     connectors = []
@@ -86,10 +89,11 @@ def building(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     )
 
 
-def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
-    low = spec.max_storeys < 3 or rng.random() < 0.5
+def _draw_plan(rng: np.random.Generator, spec: WorldSpec, index: int) -> Plan:
+    lot = index * GOLDEN % 1.0
+    low = spec.max_storeys < 3 or lot > HIGH
     storeys = min(2, spec.max_storeys) if low else spec.max_storeys
-    spans = _spans(rng, storeys)
+    spans = _spans(rng, storeys, relay=lot < RELAY)
     lengths, depths = TOWER if (0, 2) in spans else WING
     room = spec.side - 0.6
     while True:
@@ -112,13 +116,13 @@ def _draw_plan(rng: np.random.Generator, spec: WorldSpec) -> Plan:
     return Plan(frame, length, depth, empty.corridor, tuple(cores), storeys)
 
 
-def _spans(rng: np.random.Generator, storeys: int) -> list[tuple[int, int]]:
+def _spans(rng: np.random.Generator, storeys: int, relay: bool) -> list[tuple[int, int]]:
     """Storeys that each staircase joins: one through all, or a relay of one per storey, and perhaps one more."""
     if storeys == 1:
         return []
-    relay = storeys == 3 and rng.random() < 0.3
+    relay = storeys == 3 and relay
     spans = [(0, 1), (1, 2)] if relay else [(0, storeys - 1)]
-    if rng.random() < 0.7:
+    if (storeys == 2 or relay) and rng.random() < 0.25:
         first = int(rng.integers(storeys - 1))
         spans.append((first, int(rng.integers(first + 1, storeys))))
     return spans
@@ -148,7 +152,7 @@ def _draw_core(
             fits = depth >= wide
         if not fits or span > length:
             continue
-        left = float(rng.choice([0.0, 1.0, rng.uniform()])) * (length - span)
+        left = float(rng.choice([0.0, 1.0, rng.uniform()], p=(0.42, 0.42, 0.16))) * (length - span)
         left = 0.0 if left < NARROWEST else length - span if length - span - left < NARROWEST else left
         hall = (WALL + left, WALL + left + span)
         if any(o.row == row and hall[0] < o.hall[1] + NARROWEST and o.hall[0] < hall[1] + NARROWEST for o in others):
@@ -222,13 +226,7 @@ def _storey(
 def _shaft(plan: Plan, core: Core) -> tuple[Span, Span]:
     """The shaft of ``core`` as a rectangle of the plan (its frame is turned by quarters only)."""
     (u0, u1), (v0, v1) = core.stairs.shaft
-    c, s = np.cos(plan.frame.yaw), np.sin(plan.frame.yaw)
-    corners = []
-    for u, v in ((u0, v0), (u1, v1)):
-        x, y = core.frame.at(u, v)
-        dx, dy = x - plan.frame.x, y - plan.frame.y
-        corners.append((c * dx + s * dy, c * dy - s * dx))
-    (a0, b0), (a1, b1) = corners
+    (a0, b0), (a1, b1) = (plan.frame.local(*core.frame.at(u, v)) for u, v in ((u0, v0), (u1, v1)))
     return (min(a0, a1), max(a0, a1)), (min(b0, b1), max(b0, b1))
 
 

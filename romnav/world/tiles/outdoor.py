@@ -19,6 +19,8 @@ EDGE = 0.3
 """Depth of the boundary wall, hedge or fence, m."""
 UPPER = 2.4
 """Ground above this height belongs to the upper layer, so that a bridge may lead over the lower one, m."""
+LANDING, LANDING_ABOVE = 1.5, 5.0
+"""Depth of the landing in the middle of a flight, m, and the rise above which a flight has one, m."""
 CURB = (0.08, 0.15)
 """Heights that are stepped over, m."""
 
@@ -134,12 +136,16 @@ def _street(rng: np.random.Generator, side: float) -> list[Plot]:
 
 
 def _park(rng: np.random.Generator, side: float) -> list[Plot]:
-    """A hillside: two meadows with a narrower terrace between them, each a climb above the last; podiums add to it."""
-    terrace = float(rng.uniform(9.0, 12.0))
-    first = float(rng.uniform(0.4, 0.6)) * (side - terrace)
-    lines = np.array([0.0, first, first + terrace, side])
-    rises = [float(rng.choice([rng.uniform(0.5, 2.0), rng.uniform(3.6, 4.3)], p=(0.25, 0.75))) for _ in range(2)]
-    heights = np.cumsum([0.0, *rises])
+    """A hillside: two meadows two storeys apart, or each a climb from a narrower terrace between them."""
+    if rng.random() < 0.8:
+        lines = np.array([0.0, side * float(rng.uniform(0.4, 0.6)), side])
+        heights = np.array([0.0, float(rng.uniform(7.6, 8.4))])
+    else:
+        terrace = float(rng.uniform(5.5, 9.0))
+        first = float(rng.uniform(0.4, 0.6)) * (side - terrace)
+        lines = np.array([0.0, first, first + terrace, side])
+        rises = [float(rng.choice([rng.uniform(0.5, 2.0), rng.uniform(3.6, 4.3)], p=(0.15, 0.85))) for _ in range(2)]
+        heights = np.cumsum([0.0, *rises])
     strips = zip(itertools.pairwise(lines.tolist()), heights.tolist(), strict=True)
     return [Plot((0.0, side), across, z) for across, z in strips]
 
@@ -153,6 +159,8 @@ class _Site:
         """Reference heights of its layers, which change half way between, at `UPPER`."""
         self.mouths: list[tuple[float, float]] = []
         """Middles of the ends of bridges, on edges of plots."""
+        self.last: tuple[float, float] | None = None
+        """Top of the last long flight between plots: the next one often goes on near it."""
         self.solids = SolidsBuilder()
         self.connectors: list[Connector] = []
         self.railing = Railing.draw(rng)
@@ -194,10 +202,9 @@ class _Site:
         """Stretches of an edge along u that a bridge opens."""
         spans = []
         for x, y in self.mouths:
-            c, s = np.cos(frame.yaw), np.sin(frame.yaw)
-            u, v = c * (x - frame.x) + s * (y - frame.y), c * (y - frame.y) - s * (x - frame.x)
+            u, v = frame.local(x, y)
             if abs(v) < 1e-6 and 0.0 < u < length:
-                spans.append((float(u) - 1.4, float(u) + 1.4))
+                spans.append((u - 1.4, u + 1.4))
         return spans
 
     def join(self, plots: list[Plot]) -> None:
@@ -212,7 +219,9 @@ class _Site:
             if rise <= CURB[1]:
                 joined = True
             else:
-                wanted = 1 + int(self.rng.poisson(shared[1] / 28.0)) if group[low] != group[high] else 1
+                wanted = int(self.rng.random() < 0.25)
+                if group[low] != group[high]:
+                    wanted = 1 + int(self.rng.poisson(shared[1] / (90.0 if rise < LANDING_ABOVE else 14.0)))
                 joined = self.climb(*shared, plots[low].z, rise, wanted, (plots[low], plots[high])) > 0
             if joined:
                 group = [group[low] if g == group[high] else g for g in group]
@@ -238,45 +247,59 @@ class _Site:
                 break
             widest = length - 0.9
             widths = [rng.uniform(1.4, 2.2), rng.uniform(2.2, 3.5), rng.uniform(3.5, 6.0)]
-            width = float(rng.choice(widths, p=(0.5, 0.35, 0.15) if rise < 1.5 else (0.85, 0.15, 0.0)))
+            width = float(rng.choice(widths, p=(0.65, 0.3, 0.05) if rise < 1.5 else (0.85, 0.15, 0.0)))
             if min(width, widest) < 1.4:
                 break
             width = min(width, widest)
+            count = 1 + int(rise > LANDING_ABOVE)
+            each = rise / count
             flight = (
-                draw_ramp(rng, rise, width, (9.0, 15.0) if rise < 1.5 else (13.0, 15.0))
-                if rng.random() < (0.35 if rise < 1.5 else 0.15)
-                else draw_stair(rng, self.spec, rise, width, 1.35 if rise < 1.5 else 1.15)
+                draw_ramp(rng, each, width, (9.0, 15.0) if rise < 1.5 else (13.0, 15.0))
+                if rng.random() < (0.35 if rise < 1.5 else 0.15 if count == 1 else 0.0)
+                else draw_stair(rng, self.spec, each, width, 1.35 if rise < 1.5 else 1.15)
             )
-            inset = plots is not None and rng.random() < (0.35 if rise < 1.5 else 0.6)
+            run = count * flight.length + (count - 1) * LANDING
+            inset = plots is not None and (count > 1 or rng.random() < (0.35 if rise < 1.5 else 0.6))
             at = float(rng.uniform(0.4, length - width - 0.4)) + width / 2
-            foot = frame.sub(at, 0.0 if inset else flight.length, -np.pi / 2)
+            if plots is not None and self.last is not None and rng.random() < 0.7:
+                near = frame.local(*self.last)[0] + float(rng.normal(0.0, 3.0))
+                at = float(np.clip(near, 0.4 + width / 2, length - 0.4 - width / 2))
+            foot = frame.sub(at, 0.0 if inset else run, -np.pi / 2)
             v = (-width / 2, width / 2)
-            if not self.floor.fits(foot, (-1.3, flight.length + 1.3), (v[0] - 0.15, v[1] + 0.15)):
+            if not self.floor.fits(foot, (-1.3, run + 1.3), (v[0] - 0.15, v[1] + 0.15)):
                 continue
-            brink = 0.0 if inset else flight.length
+            brink = 0.0 if inset else run
             if plots is not None and not (
-                plots[0].contains(foot, (-1.3, brink), v) and plots[1].contains(foot, (brink, flight.length + 1.3), v)
+                plots[0].contains(foot, (-1.3, brink), v) and plots[1].contains(foot, (brink, run + 1.3), v)
             ):
                 continue
+            if plots is not None and rise > 1.5:
+                self.last = foot.at(run, 0.0)
             layers = self.layers(z, z + rise)
-            add_flight(self.solids, foot, z, flight, layers, base=z - 0.1)
+            points = [(-MOUTH, 0.0, z)]
+            for k in range(count):
+                u, low = k * (flight.length + LANDING), z + k * each
+                if k:
+                    landing = (u - LANDING, u)
+                    block(self.solids, foot, landing, v, (z - 0.1, low), label=Label.GROUND, layers=layers)
+                add_flight(self.solids, foot.sub(u, 0.0), low, flight, layers, base=z - 0.1)
+                points += [(u, 0.0, low), (u + flight.length, 0.0, low + each)]
+            points.append((run + MOUTH, 0.0, z + rise))
             built.append((at - width / 2, at + width / 2))
-            points = [(-MOUTH, 0.0, z), (0.0, 0.0, z), (flight.length, 0.0, z + rise)]
-            points.append((flight.length + MOUTH, 0.0, z + rise))
             self.connectors.append(Connector(flight.kind, foot.path(points), width, layers))
             guarded = rise > 0.5 and rng.random() < 0.6
             if inset and plots is not None:
-                corners = [foot.at(u, w) for u in (0.0, flight.length) for w in v]
+                corners = [foot.at(u, w) for u in (0.0, run) for w in v]
                 xs, ys = zip(*corners, strict=True)
                 plots[1].notches.append(((min(xs), max(xs)), (min(ys), max(ys))))
             for side in (-1, 1) if guarded else ():
                 if inset:
                     rail = foot.sub(0.0, side * (width / 2 + 0.06))
-                    add_railing(self.solids, rail, (0.0, flight.length), z + rise, self.railing)
+                    add_railing(self.solids, rail, (0.0, run), z + rise, self.railing)
                 else:
                     rail = foot.sub(0.0, side * (width / 2 - 0.04))
-                    add_railing(self.solids, rail, (0.0, flight.length), z, self.railing, rise=rise)
-            self.floor.reserve(foot, (-1.4, flight.length + 1.4), v, 0.7)
+                    add_railing(self.solids, rail, (0.0, run), z, self.railing, rise=rise)
+            self.floor.reserve(foot, (-1.4, run + 1.4), v, 0.7)
         if rng.random() < 0.6 and rise > 0.3:
             edge = 0.0
             for start, end in [*sorted(built + self.openings(frame, length)), (length, length)]:
@@ -288,7 +311,7 @@ class _Site:
 
     def podiums(self, plot: Plot) -> None:
         """Rotated platforms on a plot: climbed by flights, or islands as high as a curb."""
-        for _ in range(int(self.rng.integers(1, 4))):
+        for _ in range(int(self.rng.integers(0, 3))):
             for _ in range(6):
                 at = plot.frame.sub(*(float(x) for x in self.rng.uniform((0.0, 0.0), plot.size)))
                 yaw = float(self.rng.uniform(0.0, 2 * np.pi))
@@ -308,7 +331,7 @@ class _Site:
         ground = ((0.0, size[0]), (0.0, size[1]))
         block(self.solids, frame, *ground, (z - 0.1, z + rise), label=Label.GROUND, layers=self.layers(z + rise))
         sides = edges(frame, size)
-        for k in rng.permutation(4)[: 0 if island else int(rng.integers(1, 3))]:
+        for k in rng.permutation(4)[: 0 if island else 1]:
             side, length = sides[int(k)]
             self.climb(side, length, z, rise, 1)
         for side, length in sides:

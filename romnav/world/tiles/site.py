@@ -25,6 +25,11 @@ class Frame:
         c, s = float(np.cos(self.yaw)), float(np.sin(self.yaw))
         return self.x + c * u - s * v, self.y + s * u + c * v
 
+    def local(self, x: float, y: float) -> tuple[float, float]:
+        """Local coordinates of a point of the tile."""
+        c, s = float(np.cos(self.yaw)), float(np.sin(self.yaw))
+        return c * (x - self.x) + s * (y - self.y), c * (y - self.y) - s * (x - self.x)
+
     def sub(self, u: float, v: float, yaw: float = 0.0) -> Frame:
         """Frame at a local point, turned by ``yaw`` against this one."""
         return Frame(*self.at(u, v), self.yaw + yaw)
