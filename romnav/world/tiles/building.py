@@ -15,8 +15,8 @@ from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Connector, Tile, TileClass
 from romnav.world.tiles.furniture import HALL, ROOM, furnish
-from romnav.world.tiles.site import Floor, Frame, Span, block, cut
-from romnav.world.tiles.stairs import SLAB, Railing, Staircase, draw_ramp, draw_stair
+from romnav.world.tiles.site import Floor, Frame, Span, block, cut, edges
+from romnav.world.tiles.stairs import KERB, SLAB, Railing, Staircase, add_railing, draw_ramp, draw_stair
 
 WALL = 0.15
 APPROACH = 1.4
@@ -29,28 +29,43 @@ staircase joins three storeys, so that goals two storeys up lie within the paper
 HIGH, RELAY, GOLDEN = 0.46, 0.06, (5**0.5 - 1) / 2
 """Shares of buildings with three storeys, and of those in which no staircase joins all three, spread evenly over the
 tiles by multiples of the golden section."""
+ATRIA, GALLERY = 0.5, (1.5, 2.4)
+"""Share of long buildings with an atrium, and the width of the gallery around it, m."""
 KINDS = (0.55, 0.25, 0.12, 0.08)
 """Shares of staircases: U-turns across and along the building, straight ones, ramps; the last two join two storeys."""
 
 
 @dataclass(frozen=True)
-class Core:
-    """A staircase in its hall: a stretch of one row of rooms, behind a doorway or open to the corridor."""
+class Hall:
+    """A stretch of one row of rooms on the storeys from ``first`` to ``last``."""
 
-    stairs: Staircase
     row: int
-    hall: Span
-    """Extent of the hall along the corridor, m."""
-    frame: Frame
+    u: Span
+    """Extent along the corridor, m."""
     first: int
     last: int
-    """Storeys that it joins."""
     enclosed: bool
     """Whether a wall with a doorway parts the hall from the corridor."""
 
     def touches(self, storey: int) -> bool:
-        """Whether the hall is needed on ``storey``."""
+        """Whether the hall is on ``storey``."""
         return self.first <= storey <= self.last
+
+
+@dataclass(frozen=True)
+class Core(Hall):
+    """A staircase in its hall, which joins the storeys."""
+
+    stairs: Staircase
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class Atrium(Hall):
+    """A hall two storeys high, which a gallery behind railings looks into from above."""
+
+    hole: tuple[Span, Span]
+    """Where the upper floor is open, in the plan's frame, m."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +77,12 @@ class Plan:
     depth: float
     corridor: Span
     cores: tuple[Core, ...]
+    atria: tuple[Atrium, ...]
     storeys: int
+
+    def halls(self, storey: int) -> list[Hall]:
+        """Halls on ``storey``."""
+        return [hall for hall in (*self.cores, *self.atria) if hall.touches(storey)]
 
     def row(self, row: int) -> Span:
         """Extent across the corridor of the row of rooms below (0) or above (1) it."""
@@ -107,13 +127,14 @@ def _draw_plan(rng: np.random.Generator, spec: WorldSpec, index: int) -> Plan:
     frame = middle.sub(-length / 2, -depth / 2)
     width = float(rng.uniform(1.8, 2.6))
     start = (depth - width) * float(rng.uniform(0.38, 0.62))
-    empty = Plan(frame, length, depth, (start, start + width), (), storeys)
+    empty = Plan(frame, length, depth, (start, start + width), (), (), storeys)
     cores: list[Core] = []
     for first, last in spans:
         core = _draw_core(rng, spec, empty, cores, first, last)
         if core is not None:
             cores.append(core)
-    return Plan(frame, length, depth, empty.corridor, tuple(cores), storeys)
+    atrium = _draw_atrium(rng, empty, cores) if lengths == WING[0] and rng.random() < ATRIA else None
+    return Plan(frame, length, depth, empty.corridor, tuple(cores), (atrium,) if atrium else (), storeys)
 
 
 def _spans(rng: np.random.Generator, storeys: int, relay: bool) -> list[tuple[int, int]]:
@@ -155,13 +176,13 @@ def _draw_core(
         left = float(rng.choice([0.0, 1.0, rng.uniform()], p=(0.42, 0.42, 0.16))) * (length - span)
         left = 0.0 if left < NARROWEST else length - span if length - span - left < NARROWEST else left
         hall = (WALL + left, WALL + left + span)
-        if any(o.row == row and hall[0] < o.hall[1] + NARROWEST and o.hall[0] < hall[1] + NARROWEST for o in others):
+        if not _clear(row, hall, others):
             continue
         enclosed = rng.random() < 0.8
         if kind == 0:
             at = hall[0] + float(rng.uniform(wide / 2, span - wide / 2))
             mouth, yaw = (v1 - reach, np.pi / 2) if row else (v0 + reach, -np.pi / 2)
-            return Core(stairs, row, hall, plan.frame.sub(at, mouth, yaw), first, last, enclosed)
+            return Core(row, hall, first, last, enclosed, stairs, plan.frame.sub(at, mouth, yaw))
         side = v1 - wide / 2 if row else v0 + wide / 2
         if rng.random() < 0.5 and depth > wide + 1.0:
             side = float(rng.uniform(v0 + wide / 2, v1 - wide / 2))
@@ -169,8 +190,30 @@ def _draw_core(
             frame = plan.frame.sub(hall[0] + APPROACH, side)
         else:
             frame = plan.frame.sub(hall[1] - APPROACH, side, np.pi)
-        return Core(stairs, row, hall, frame, first, last, enclosed)
+        return Core(row, hall, first, last, enclosed, stairs, frame)
     return None
+
+
+def _draw_atrium(rng: np.random.Generator, plan: Plan, others: list[Core]) -> Atrium | None:
+    """A hall under a gallery clear of the ``others``; None where there is no room for one."""
+    for _ in range(20):
+        row = int(rng.integers(2))
+        v = plan.row(row)
+        span = float(rng.uniform(8.0, 13.0))
+        start = WALL + NARROWEST + float(rng.uniform()) * (plan.length - 2 * (WALL + NARROWEST) - span)
+        u = (start, start + span)
+        if v[1] - v[0] < 6.0 or not _clear(row, u, others):
+            continue
+        side, end = rng.uniform(*GALLERY, 2), rng.uniform(*GALLERY, 2)
+        hole = (u[0] + float(end[0]), u[1] - float(end[1])), (v[0] + float(side[0]), v[1] - float(side[1]))
+        first = int(rng.integers(plan.storeys - 1))
+        return Atrium(row, u, first, first + 1, bool(rng.random() < 0.3), hole)
+    return None
+
+
+def _clear(row: int, u: Span, others: list[Core]) -> bool:
+    """Whether a hall at ``u`` of a row is clear of the ``others`` by a room."""
+    return not any(o.row == row and u[0] < o.u[1] + NARROWEST and o.u[0] < u[1] + NARROWEST for o in others)
 
 
 def _storey(
@@ -185,7 +228,8 @@ def _storey(
     top = z + spec.storey_height
     ceiling = top - SLAB
     holes = [_shaft(plan, core) for core in plan.cores if core.first < storey <= core.last]
-    for u, v in cut(((0.0, plan.length), (0.0, plan.depth)), holes):
+    voids = [atrium.hole for atrium in plan.atria if storey == atrium.last]
+    for u, v in cut(((0.0, plan.length), (0.0, plan.depth)), holes + voids):
         block(solids, frame, u, v, (z - SLAB, z), label=Label.GROUND, layers=(layer, layer))
     _outer_walls(solids, rng, plan, z, top)
 
@@ -205,6 +249,11 @@ def _storey(
             core.stairs.guard(solids, core.frame, z, railing, departs=storey < core.last)
         if storey < core.last:
             connectors.append(core.stairs.build(solids, core.frame, z, layer, railing))
+    for u, v in voids:
+        corner, size = frame.sub(u[0], v[0]), (u[1] - u[0], v[1] - v[0])
+        floor.reserve(corner, (0.0, size[0]), (0.0, size[1]), 0.2)
+        for side, length in edges(corner, size):
+            add_railing(solids, side.sub(0.0, KERB / 2), (0.0, length), z, railing)
     rooms: list[tuple[Span, Span]] = []
     for row in (0, 1):
         rooms += _rooms(solids, rng, plan, floor, row, storey, (z, ceiling))
@@ -212,12 +261,12 @@ def _storey(
         area = (u[1] - u[0]) * (v[1] - v[0])
         at = frame.sub(u[0], v[0])
         furnish(solids, rng, floor, at, (u[1] - u[0], v[1] - v[0]), z, ROOM, int(rng.poisson(area / 9.0)))
-    for core in plan.cores:
-        if core.touches(storey):
-            v = plan.row(core.row)
-            size = (core.hall[1] - core.hall[0], v[1] - v[0])
-            count = int(rng.poisson(size[0] * size[1] / 16.0))
-            furnish(solids, rng, floor, frame.sub(core.hall[0], v[0]), size, z, HALL, count)
+    for hall in plan.halls(storey):
+        v = plan.row(hall.row)
+        size = (hall.u[1] - hall.u[0], v[1] - v[0])
+        furnish(
+            solids, rng, floor, frame.sub(hall.u[0], v[0]), size, z, HALL, int(rng.poisson(size[0] * size[1] / 16.0))
+        )
     size = (plan.length - 2 * WALL, plan.corridor[1] - plan.corridor[0])
     furnish(solids, rng, floor, frame.sub(WALL, plan.corridor[0]), size, z, HALL, int(rng.poisson(2.0)))
     return connectors
@@ -246,12 +295,12 @@ def _outer_walls(solids: SolidsBuilder, rng: np.random.Generator, plan: Plan, z:
         count = max(1, int(length / rng.uniform(3.0, 4.5)))
         pitch = length / count
         window = float(rng.uniform(1.0, 0.6 * pitch))
-        edges = [
+        ends = [
             0.0,
             *(pitch * k + s * window / 2 for k in np.arange(count) + 0.5 for s in (-1, 1)),
             length - WALL,
         ]
-        for a, b in zip(edges[::2], edges[1::2], strict=True):
+        for a, b in zip(ends[::2], ends[1::2], strict=True):
             block(solids, side, (float(a), float(b)), (0.0, WALL), (sill, head))
 
 
@@ -266,7 +315,7 @@ def _rooms(
 ) -> list[tuple[Span, Span]]:
     """Divide a row into rooms around its halls, with walls and doors; their clear rectangles."""
     v = plan.row(row)
-    halls = sorted(core.hall for core in plan.cores if core.row == row and core.touches(storey))
+    halls = sorted(hall.u for hall in plan.halls(storey) if hall.row == row)
     rooms: list[tuple[Span, Span]] = []
     start = WALL
     for hall in [*halls, (plan.length - WALL, plan.length)]:
@@ -274,11 +323,11 @@ def _rooms(
         if stretch > 2.0:
             count = max(1, round(stretch / float(rng.uniform(3.4, 6.5))))
             cuts = start + stretch * (np.arange(1, count) + rng.uniform(-0.15, 0.15, count - 1)) / count
-            edges = [start, *(float(c) for c in cuts), hall[0]]
-            for a, b in itertools.pairwise(edges):
+            bounds = [start, *(float(c) for c in cuts), hall[0]]
+            for a, b in itertools.pairwise(bounds):
                 rooms.append(((a, b), v))
-            bounds = edges[1:-1] + [e for e in (start, hall[0]) if WALL < e < plan.length - WALL - 1e-9]
-            for u in bounds:
+            parted = bounds[1:-1] + [e for e in (start, hall[0]) if WALL < e < plan.length - WALL - 1e-9]
+            for u in parted:
                 side = plan.frame.sub(u, v[0], np.pi / 2)
                 _wall(solids, rng, floor, side, v[1] - v[0], z, rng.random() < 0.35)
         start = hall[1]
@@ -286,9 +335,9 @@ def _rooms(
     for (a, b), _ in rooms:
         if rng.random() < 0.88:
             _wall(solids, rng, floor, edge.sub(a, 0.0), b - a, z, True)
-    for core in plan.cores:
-        if core.row == row and core.touches(storey) and core.enclosed:
-            _wall(solids, rng, floor, edge.sub(core.hall[0], 0.0), core.hall[1] - core.hall[0], z, True)
+    for hall in plan.halls(storey):
+        if hall.row == row and hall.enclosed:
+            _wall(solids, rng, floor, edge.sub(hall.u[0], 0.0), hall.u[1] - hall.u[0], z, True)
     return rooms
 
 
