@@ -86,11 +86,15 @@ class ReducedOrderModel:
         )
         target = here + tries
         node = world.node_at(self.tile.repeat(4), self.layer.repeat(4), target.flatten(0, 1)).view(4, -1)
-        first = (node >= 0).int().argmax(dim=0)
+        free = node >= 0
+        # two occupied cells that touch at a corner let nothing through between them, as in `Grids.neighbours`
+        diagonal = (world.index(target[0]) != world.index(here)).all(dim=1)
+        free[0] &= ~diagonal | (free[1] & free[2])
+        first = free.int().argmax(dim=0)
         row = torch.arange(len(first), device=first.device)
         xy = target[first, row]
         # no free candidate (a start in an occupied cell): argmax says 0, and the robot must stay
-        stuck = (node < 0).all(dim=0)
+        stuck = ~free.any(dim=0)
         self._place(torch.where(stuck[:, None], here, xy))
         return (first > 0) | stuck
 

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -58,6 +60,30 @@ def test_never_enters_an_occupied_cell(world: World) -> None:
         assert torch.equal(world.layer[node], robot.layer)
         height = world.surface(robot.tile, robot.layer, robot.position[:, :2])
         assert torch.equal(height, robot.position[:, 2])
+
+
+def test_walks_only_where_geodesics_do(world: World) -> None:
+    """Every half step leads to one of the eight cells that the grid calls neighbours: never between two occupied
+    cells that touch at a corner. A tenth of the cells is occupied at random, so that there are many such pairs."""
+    generator = torch.Generator().manual_seed(3)
+    gone = torch.rand(len(world.position), generator=generator) < 0.1
+    scattered = replace(world, node=torch.where((world.node >= 0) & gone[world.node.long()], -1, world.node))
+    neighbours = []
+    for grid, first in zip(world.grids, world.node_start.tolist(), strict=False):
+        kept = np.where((grid.node >= 0) & ~gone.numpy()[grid.node + first], grid.node, -1)
+        near = replace(grid, node=kept).neighbours()
+        neighbours.append(torch.from_numpy(np.where(near >= 0, near + first, -1)))
+    adjacent = torch.cat(neighbours)
+    robot = at(scattered, torch.nonzero(~gone)[::29, 0], torch.zeros(len(torch.nonzero(~gone)[::29])))
+    crossed = 0
+    for _ in range(60):
+        before = world.node_at(robot.tile, robot.layer, robot.position[:, :2])
+        cell = world.index(robot.position[:, :2])
+        robot._slide(torch.rand(len(before), 2, generator=generator) * 0.2 - 0.1)
+        after = world.node_at(robot.tile, robot.layer, robot.position[:, :2])
+        assert ((adjacent[before] == after[:, None]).any(dim=1) | (before == after)).all()
+        crossed += int((world.index(robot.position[:, :2]) != cell).all(dim=1).sum())
+    assert crossed > 100, "no diagonal step was tried"
 
 
 def test_walks_over_no_drop(world: World) -> None:
