@@ -138,6 +138,9 @@ class PPOSpec(Config):
     """Target of the adaptive learning rate (A)."""
     max_grad_norm: float = 1.0
     """Gradient clip (A)."""
+    keep: int | None = Field(default=None, ge=1)
+    """Iterations after which the policy so far is kept beside the run, again and again (A: its success on the `dev`
+    episodes shows progress where success while training depends on where the robots are let go)."""
     threads: int = 1
     """PyTorch threads of the run (A: another number gives other bits; two runs on a thread each do half as much again
     as one run on two)."""

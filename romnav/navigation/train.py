@@ -45,6 +45,7 @@ def train(
 ) -> Path:
     """Train one policy on robots that ``body`` makes, and write ``out/policy.pt`` and ``out/curve.csv``.
 
+    Every ``spec.ppo.keep`` iterations the policy so far is kept as ``out/kept/<iteration>.pt``.
     ``out/checkpoint.pt`` holds the whole state of the run every two minutes: a run that is killed and started again
     ends in the same weights as one left alone. It is deleted at the end.
 
@@ -112,15 +113,21 @@ def _train(
         _check_finite(state, done, curve[-1], ppo)
         if progress:
             progress(done * steps, total * steps, _summary(curve))
+        if spec.ppo.keep and done % spec.ppo.keep == 0:
+            _save_policy(out / "kept" / f"{done:06d}.pt", identity, ppo, done * steps, seconds)
         if time.monotonic() - saved_at > SAVE_EVERY and done < total:
             _save(state, identity, ppo, env, done, seconds, curve)
             saved_at = time.monotonic()
     _write_curve(out / "curve.csv", curve)
     policy = out / "policy.pt"
-    content = {**identity, "actor": ppo.actor.state_dict(), "steps": total * steps, "hours": seconds / 3600}
-    checkpoint.save(policy, content)
+    _save_policy(policy, identity, ppo, total * steps, seconds)
     state.unlink(missing_ok=True)
     return policy
+
+
+def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:
+    content = {**identity, "actor": ppo.actor.state_dict(), "steps": steps, "hours": seconds / 3600}
+    checkpoint.save(path, content)
 
 
 def _save(

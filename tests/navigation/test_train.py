@@ -177,6 +177,25 @@ def test_a_policy_with_its_own_encoder_carries_and_uses_it(world: World, spec: N
     assert not torch.allclose(frozen(obs["pretrained"]), mine, atol=1e-4)
 
 
+def test_policies_on_the_way_are_kept(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
+    """The one kept after two iterations is the policy of a run of two; the last is the run's own."""
+
+    unscheduled = spec.env.model_copy(update={"reward": RewardSpec(action_rate=(-0.01, -0.01))})
+
+    def run(name: str, **changes: int) -> Path:
+        ppo = spec.ppo.model_copy(update=changes)
+        train.train(spec.model_copy(update={"env": unscheduled, "ppo": ppo}), world, perception, tmp_path / name, 1)
+        return tmp_path / name
+
+    long, short = run("long", iterations=4, keep=2), run("short", iterations=2)
+    assert sorted(file.name for file in (long / "kept").iterdir()) == ["000002.pt", "000004.pt"]
+    kept = [checkpoint.read(long / "kept" / name) for name in ("000002.pt", "000004.pt")]
+    assert_same(kept[0]["actor"], weights(short))
+    assert_same(kept[1]["actor"], weights(long))
+    assert kept[0]["steps"] * 2 == kept[1]["steps"]
+    assert not (short / "kept").exists()
+
+
 def test_learning_rate_stays_in_bounds(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
     low, high = spec.ppo.learning_rate_range
     tight = spec.model_copy(update={"ppo": spec.ppo.model_copy(update={"desired_kl": 1e-9, "iterations": 6})})
