@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from romnav.config import Config
 from romnav.robot.spec import BodySpec
@@ -27,6 +27,12 @@ class EpisodeSetSpec(Config):
     """Spawns uniform over free cells off stairs and mouths, where a humanoid can stand; goals as in training (A)."""
     seed: int = 3000
     """Seed of the draw."""
+
+    @model_validator(mode="after")
+    def _part_of_the_episodes(self) -> Self:
+        if not 0 <= self.cross <= self.episodes:
+            raise ValueError(f"cross: {self.cross} of {self.episodes} episodes; set it between 0 and 'episodes'")
+        return self
 
 
 class EvaluationSpec(Config):

@@ -18,6 +18,7 @@ from tests.navigation.conftest import TOKENS, FakePerception
 SPEC = EpisodeSetSpec(
     world=WorldSpec(tiles=8, seed=51, goals_per_tile=16),
     episodes=160,
+    cross=80,
     sampler=SamplerSpec(stair_probability=0.0),
 )
 
@@ -111,4 +112,4 @@ def test_measures_of_a_robot_that_stands_still(world: World, paired: EpisodeSet)
     assert (out["time"] == 2.0).all()
     assert (out["path_length"] == 0.0).all()
     assert (out["collisions"] == 0).all()
-    np.testing.assert_allclose(out["final_distance"], paired.columns["geodesic"], atol=0.15)
+    np.testing.assert_allclose(out["final_distance"], paired.columns["geodesic"], atol=0.2 * 2**0.5)

@@ -61,20 +61,28 @@ def test_the_four_samplers(world: World, probability: float, cap: str) -> None:
 
 
 def test_cross_level_shares(world: World) -> None:
-    start = draw(world, SamplerSpec())
+    """Always on tiles of three storeys, else half of the time, wherever the spawn has goals of both kinds in reach."""
+    spec = SamplerSpec()
+    start = draw(world, spec)
     spawn, goal, _ = facts(world, start)
     cross = (world.position[spawn, 2] - world.position[goal, 2]).abs() > LEVEL_GAP
-    for t, tile in enumerate(world.tiles):
+    both_anywhere = 0
+    for t, (tile, grids) in enumerate(zip(world.tiles, world.grids, strict=True)):
         here = start.tile == t
-        share = cross[here].float().mean().item()
-        levels = world.position[world.goal[world.goal_start[t] : world.goal_start[t + 1]], 2]
-        if len(tile.storeys) == 3:
-            # always, but for spawns with no goal of another level within the cap
-            assert share > 0.9
-        elif levels.max() - levels.min() > LEVEL_GAP:
-            assert share == pytest.approx(0.5, abs=0.12)
-        else:
-            assert share <= 0.5  # only stair spawns differ in height from their goals
+        goals = world.goal[world.goal_start[t] : world.goal_start[t + 1]]
+        field = fields(grids, (goals - world.node_start[t]).numpy()).astype(np.float32) * UNIT
+        geodesic = torch.from_numpy(field)[:, spawn[here] - world.node_start[t]]
+        valid = (geodesic >= spec.min_distance) & (geodesic <= spec.max_distance)
+        other = (world.position[goals, 2][:, None] - world.position[spawn[here], 2]).abs() > LEVEL_GAP
+        has_other, has_same = (valid & other).any(dim=0), (valid & ~other).any(dim=0)
+        both = has_other & has_same
+        assert not cross[here][has_same & ~has_other].any()
+        assert cross[here][has_other & ~has_same].all()
+        if both.sum() > 100:
+            share = cross[here][both].float().mean().item()
+            assert share == pytest.approx(1.0 if len(tile.storeys) == 3 else 0.5, abs=2 / int(both.sum()) ** 0.5)
+            both_anywhere += 1
+    assert both_anywhere >= 4
 
 
 def test_stair_spawns_are_on_or_at_the_mouth_of_a_connector(world: World) -> None:

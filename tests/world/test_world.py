@@ -42,7 +42,7 @@ def test_position_and_cell_agree_at_every_node(world: World) -> None:
 
 
 def test_outside_the_tile_is_occupied(world: World) -> None:
-    xy = torch.tensor([[-0.01, 5.0], [20.0, 5.0], [5.0, -3.0], [5.0, 25.0]])
+    xy = torch.tensor([[-0.01, 5.0], [SPEC.side, 5.0], [5.0, -3.0], [5.0, SPEC.side + 5.0]])
     zero = torch.zeros(4, dtype=torch.int64)
     assert (world.node_at(zero, zero, xy) == -1).all()
 

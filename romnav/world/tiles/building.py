@@ -133,7 +133,8 @@ def _draw_plan(rng: np.random.Generator, spec: WorldSpec, index: int) -> Plan:
         core = _draw_core(rng, spec, empty, cores, first, last)
         if core is not None:
             cores.append(core)
-    atrium = _draw_atrium(rng, empty, cores) if lengths == WING[0] and rng.random() < ATRIA else None
+    long = storeys > 1 and lengths == WING[0]
+    atrium = _draw_atrium(rng, empty, cores) if long and rng.random() < ATRIA else None
     return Plan(frame, length, depth, empty.corridor, tuple(cores), (atrium,) if atrium else (), storeys)
 
 
