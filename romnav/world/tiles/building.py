@@ -316,28 +316,28 @@ def _rooms(
 ) -> list[tuple[Span, Span]]:
     """Divide a row into rooms around its halls, with walls and doors; their clear rectangles."""
     v = plan.row(row)
-    halls = sorted(hall.u for hall in plan.halls(storey) if hall.row == row)
+    halls = [hall for hall in plan.halls(storey) if hall.row == row]
     rooms: list[tuple[Span, Span]] = []
     start = WALL
-    for hall in [*halls, (plan.length - WALL, plan.length)]:
-        stretch = hall[0] - start
+    for low, high in [*sorted(hall.u for hall in halls), (plan.length - WALL, plan.length)]:
+        stretch = low - start
         if stretch > 2.0:
             count = max(1, round(stretch / float(rng.uniform(3.4, 6.5))))
             cuts = start + stretch * (np.arange(1, count) + rng.uniform(-0.15, 0.15, count - 1)) / count
-            bounds = [start, *(float(c) for c in cuts), hall[0]]
+            bounds = [start, *(float(c) for c in cuts), low]
             for a, b in itertools.pairwise(bounds):
                 rooms.append(((a, b), v))
-            parted = bounds[1:-1] + [e for e in (start, hall[0]) if WALL < e < plan.length - WALL - 1e-9]
+            parted = bounds[1:-1] + [e for e in (start, low) if WALL < e < plan.length - WALL - 1e-9]
             for u in parted:
                 side = plan.frame.sub(u, v[0], np.pi / 2)
                 _wall(solids, rng, floor, side, v[1] - v[0], z, rng.random() < 0.35)
-        start = hall[1]
+        start = high
     edge = plan.frame.sub(0.0, plan.corridor[0] if row == 0 else plan.corridor[1])
     for (a, b), _ in rooms:
         if rng.random() < 0.88:
             _wall(solids, rng, floor, edge.sub(a, 0.0), b - a, z, True)
-    for hall in plan.halls(storey):
-        if hall.row == row and hall.enclosed:
+    for hall in halls:
+        if hall.enclosed:
             _wall(solids, rng, floor, edge.sub(hall.u[0], 0.0), hall.u[1] - hall.u[0], z, True)
     return rooms
 
