@@ -51,6 +51,11 @@ class Project:
         """The file of an experiment."""
         return self.root / "experiments" / f"{experiment}.toml"
 
+    @property
+    def arms(self) -> set[str]:
+        """Names of all arms, trained and scripted."""
+        return {*SCRIPTED, *(name for experiment in self.experiments.values() for name in experiment.arms)}
+
     def having(self, arm: str) -> tuple[str, Experiment]:
         """An experiment that has a trained arm.
 
@@ -60,8 +65,7 @@ class Project:
         for name, experiment in self.experiments.items():
             if arm in experiment.arms:
                 return name, experiment
-        known = {name for experiment in self.experiments.values() for name in experiment.arms}
-        raise RomnavError(f"unknown arm {arm}{suggest(arm, {*known, *SCRIPTED})}")
+        raise RomnavError(f"unknown arm {arm}{suggest(arm, self.arms)}")
 
     def driver(self, arm: str) -> str:
         """The arm whose policy drives ``arm``: itself, unless it says otherwise.

@@ -1,0 +1,5 @@
+"""``python -m romnav.cli`` is ``romnav``."""
+
+from romnav.cli import main
+
+main()

@@ -1,0 +1,67 @@
+"""The program: its groups of commands, and what holds for all of them."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from romnav import __version__
+from romnav.cli.options import AtScale, ResultsOption, ScaleOption
+from romnav.errors import RomnavError
+
+
+class _Program(TyperGroup):
+    """Turns a user's mistake into one line, and Ctrl-C into how to go on."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except RomnavError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            again = shlex.join(["romnav", *(word for word in sys.argv[1:] if word != "--no-resume")])
+            typer.echo(f"\nstopped; what is done is kept, go on with: {again}", err=True)
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=_Program,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Train, evaluate and compare mapless multi-floor navigation policies (RoM-Nav).",
+    epilog="First run: romnav run ablation spawn-goal --scale smoke",
+)
+run = typer.Typer(no_args_is_help=True, help="Run an experiment from training to tables.")
+train = typer.Typer(no_args_is_help=True, help="Train one part.")
+play = typer.Typer(no_args_is_help=True, help="Draw what the parts make.")
+app.add_typer(run, name="run")
+app.add_typer(train, name="train")
+app.add_typer(play, name="play")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"romnav {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _before_the_command(
+    ctx: typer.Context,
+    results: ResultsOption = None,
+    scale: ScaleOption = "smoke",
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
+    ctx.obj = AtScale(results, scale)
+
+
+def main() -> None:
+    """Entry point of ``romnav``."""
+    app()

@@ -1,0 +1,129 @@
+"""``romnav eval``, ``results`` and ``check``: how well arms do, and whether they still do."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from typing import Annotated, Any
+
+import typer
+
+from romnav.cli.app import app
+from romnav.cli.options import AtScale, DeviceJob, SeedOption, arms, command
+from romnav.cli.printing import print_table
+from romnav.errors import RomnavError
+
+RESULT_COLUMNS = {
+    "arm": "arm",
+    "seed": "seed",
+    "sr_45": "SR@45",
+    "sr_45_same": "same",
+    "sr_45_cross": "cross",
+    "sr_120": "SR@120",
+    "t2g": "T2G/s",
+    "spl": "SPL",
+    "falls": "falls",
+}
+TERRAIN_COLUMNS = {
+    "terrain": "terrain",
+    "command": "command",
+    "trials": "trials",
+    "crossed": "crossed",
+    "target": "to reach",
+    "fell": "fell",
+    "velocity_error": "error m/s",
+    "yaw_error": "error rad/s",
+}
+CONTRAST_COLUMNS = {
+    "a": "a",
+    "b": "b",
+    "horizon": "s",
+    "level": "level",
+    "diff": "diff",
+    "lo": "lo",
+    "hi": "hi",
+    "n": "n",
+}
+
+
+@command(app, "eval")
+def evaluate(
+    job: DeviceJob,
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="ARMS...",
+            help="Trained arms, the scripted ones (oracle, straight), or locomotion for its terrain test.",
+            autocompletion=arms,
+        ),
+    ],
+    paired: Annotated[bool, typer.Option("--paired", help="Compare the arms episode by episode.")] = False,
+    seed: SeedOption = None,
+) -> None:
+    """Evaluate arms on the episode set that all arms share, or the locomotion policy on its terrain test."""
+    from romnav.experiment.run import require_trained
+
+    if "locomotion" in names:
+        _evaluate_locomotion(job)
+        names = [name for name in names if name != "locomotion"]
+        if not names:
+            return
+    stages = [job.plan.episodes(n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+    require_trained(stages)
+    job.make(stages, {"episodes"})
+    _print_results(_collect(job), names, paired)
+
+
+@command(app, "results")
+def results(
+    at: AtScale, as_json: Annotated[bool, typer.Option("--json", help="As JSON, for scripts.")] = False
+) -> None:
+    """Print every evaluated arm and every paired contrast of a scale."""
+    collected = _collect(at)
+    if as_json:
+        typer.echo(json.dumps(collected, indent=2))
+    else:
+        _print_results(collected, [], contrasts=True)
+
+
+@command(app, "check")
+def check(at: AtScale) -> None:
+    """Hold the results against the bands in results/<scale>/bands.json (nightly regression)."""
+    from romnav.experiment.bands import check
+
+    # bands belong to the project: --results is where the results of today lie
+    bands = at.project.root / "results" / at.plan.scale.name / "bands.json"
+    typer.echo("\n".join(check(_collect(at), bands)))
+
+
+def _evaluate_locomotion(job: DeviceJob) -> None:
+    from romnav.experiment import store
+
+    terrain, walked = job.plan.terrain(), job.plan.locomotion()
+    if not (walked.folder / "policy.pt").exists():
+        train = f"romnav train locomotion --scale {job.scale}"
+        raise RomnavError(f"{walked.folder}: no locomotion policy; train one with `{train}`")
+    job.make([terrain], {"terrain"})
+    record = store.read(terrain)
+    turning = record.facts["yaw_error"] if record else {}
+    rows = json.loads((terrain.folder / terrain.outputs[0]).read_text("utf-8"))
+    rows = [row | {"yaw_error": turning.get(row["terrain"])} for row in rows]
+    print_table("Locomotion, shares of trials", rows, TERRAIN_COLUMNS)
+
+
+def _collect(at: AtScale) -> dict[str, Any]:
+    from romnav.report.results import collect
+
+    return collect(at.project.results, at.plan.scale.name)
+
+
+def _print_results(collected: dict[str, Any], arms: list[str], contrasts: bool) -> None:
+    """Prints metrics (percent, s) and contrasts (percentage points), of ``arms`` only unless empty."""
+    chosen = [run for run in collected["arms"] if not arms or run["arm"] in arms]
+    print_table("Success rates in percent", chosen, RESULT_COLUMNS)
+    if contrasts:
+        order = list(dict.fromkeys(run["arm"] for run in chosen))
+        pairs = list(itertools.combinations(order, 2))
+        rows = [c for pair in pairs for c in collected["contrasts"] if (c["a"], c["b"]) == pair]
+        print_table("Paired differences a - b in percentage points, 95 % intervals", rows, CONTRAST_COLUMNS)
+    typer.echo(f"scale {collected['scale']}, episode set {collected['episode_set']}")

@@ -1,0 +1,38 @@
+"""``romnav play``: pictures of the parts at work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from romnav.cli.app import play
+from romnav.cli.options import AtScale, command
+
+
+@command(play, "world")
+def world(
+    at: AtScale,
+    seed: Annotated[int, typer.Option(help="Seed of the generator.")] = 0,
+    tile: Annotated[int, typer.Option(min=0, help="Which tile of that seed; the classes take turns.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
+) -> None:
+    """Draw a tile of the terrain in 3D beside its occupancy grids."""
+    from romnav.report.pictures import draw_tile
+    from romnav.world.tiles import generate
+
+    path = out or at.plan.folder / "figures" / f"world-{seed}-{tile}.png"
+    draw_tile(*generate(at.plan.scale.settings.world.model_copy(update={"seed": seed}), tile), path)
+    typer.echo(path)
+
+
+@command(play, "locomotion")
+def locomotion(at: AtScale) -> None:
+    """Draw how the locomotion policy walks each terrain, and its training curve."""
+    from romnav.robot.locomotion.play import curve, strip
+
+    walked, figures = at.plan.locomotion().folder, at.plan.folder / "figures"
+    for path in strip(walked / "policy.pt", figures):
+        typer.echo(path)
+    typer.echo(curve(walked / "curve.csv", figures / "locomotion-curve.png"))

@@ -1,0 +1,92 @@
+"""``romnav run`` and ``romnav tables``: experiments from training to tables, and tables from what is recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from romnav.cli.app import app, run
+from romnav.cli.options import DeviceJob, ExperimentArgument, Job, SeedOption, command, experiments
+from romnav.errors import RomnavError
+
+if TYPE_CHECKING:
+    from romnav.experiment.plan import Plan, Stage
+
+
+@command(run, "ablation")
+def ablation(job: DeviceJob, name: ExperimentArgument, seed: SeedOption = None) -> None:
+    """Train every arm of an ablation, evaluate them if it has tables of episodes, then write and print its tables."""
+    from romnav.experiment.launch import stages_side_by_side
+    from romnav.experiment.run import EVERYTHING
+
+    reports = _reports(job.plan, "ablation", name, seed)
+    stages = job.pending(reports, EVERYTHING)
+    if job.device == "cpu":
+        job.perform([stage for stage in stages if stage.kind == "encoder"])
+        for kind in ("policy", "episodes"):
+            stages_side_by_side(job.plan, [stage for stage in stages if stage.kind == kind], job.resume)
+        stages = [stage for stage in stages if stage in reports]
+    job.perform(stages)
+    for report in reports:
+        _print_tables(report)
+
+
+def _register_trials(kind: str, purpose: str) -> None:
+    """The command of an experiment that consists of trials."""
+
+    @command(run, kind, help=f"{purpose} with the safety filter off and on; write table and figure.")
+    def trials(
+        job: DeviceJob,
+        name: ExperimentArgument = kind,
+        arm: Annotated[
+            list[str] | None, typer.Option("--arm", help="Only this arm, trained or scripted; may be repeated.")
+        ] = None,
+        seed: SeedOption = None,
+    ) -> None:
+        from romnav.experiment.spec import suggest
+
+        (report,) = _reports(job.plan, kind, name, seed)
+        known = {str(stage.arm) for stage in report.upstream}
+        for one in arm or ():
+            if one not in known:
+                raise RomnavError(f"{job.project.file(name)}: no arm {one}{suggest(one, known)}")
+        job.make([stage for stage in report.upstream if not arm or stage.arm in arm], {"trials"})
+        job.perform([report])
+        _print_tables(report)
+
+
+_register_trials("safety", "Drive every arm through the three obstacle sets")
+_register_trials("deploy", "Drive every arm through the four long deployments")
+
+
+@command(app, "tables")
+def tables(
+    job: Job,
+    name: Annotated[str | None, typer.Argument(help="Experiment; default: all.", autocompletion=experiments)] = None,
+) -> None:
+    """Write tables and figures again from what is recorded; nothing is trained or evaluated."""
+    known = job.project.experiments
+    reports = [s for n in ([name] if name else known) for s in job.plan.reports(n, job.project.experiment(n).seeds)]
+    recorded = [r for r in reports if any((s.folder / s.outputs[-1]).exists() for s in r.upstream)]
+    for stage in recorded or reports:
+        job.perform([stage])
+        _print_tables(stage)
+
+
+def _reports(plan: Plan, kind: str, name: str, seed: int | None) -> list[Stage]:
+    """The reports of an experiment, which has to be of a kind; over all of its training seeds or one."""
+    experiment = plan.project.experiment(name)
+    if experiment.kind != kind:
+        raise RomnavError(
+            f"{plan.project.file(name)}: key kind is {experiment.kind}, not {kind}; "
+            f"run `romnav run {experiment.kind} {name}`"
+        )
+    return plan.reports(name, experiment.seeds if seed is None else (seed,))
+
+
+def _print_tables(stage: Stage) -> None:
+    for name in stage.outputs:
+        if name.endswith(".md"):
+            typer.echo((stage.folder / name).read_text("utf-8"))
+    typer.echo(f"{stage.kind}: {stage.folder}", err=True)

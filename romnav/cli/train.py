@@ -1,0 +1,44 @@
+"""``romnav train``: one part."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from romnav.cli.app import train
+from romnav.cli.options import ArmArgument, DeviceJob, SeedOption, command
+from romnav.errors import RomnavError
+
+
+@command(train, "encoder")
+def encoder(
+    job: DeviceJob,
+    sensor: Annotated[str | None, typer.Argument(help="lidar or depth; default: both.")] = None,
+) -> None:
+    """Pretrain the encoders, then measure and draw what they make of tiles that they have not seen."""
+    from romnav.experiment.plan import PRETRAINING
+    from romnav.experiment.spec import suggest
+
+    if sensor and sensor not in PRETRAINING:
+        raise RomnavError(f"unknown sensor {sensor}{suggest(sensor, PRETRAINING)}")
+    job.make([job.plan.quality(s) for s in ([sensor] if sensor else PRETRAINING)], {"encoder"})
+
+
+@command(train, "policy")
+def policy(job: DeviceJob, arm: ArmArgument, seed: SeedOption = None) -> None:
+    """Train the navigation policy of an arm, and its encoder if that is missing."""
+    seeds = job.project.seeds(arm) if seed is None else (seed,)
+    job.make([job.plan.policy(arm, s) for s in seeds], {"policy"})
+
+
+@command(train, "locomotion")
+def locomotion(job: DeviceJob) -> None:
+    """Train the policy that walks the humanoid; a larger number of iterations in the scale continues it."""
+    job.make([job.plan.locomotion()], {"locomotion"})
+
+
+@command(train, "gaits")
+def gaits(job: DeviceJob) -> None:
+    """Record the gait library of the locomotion policy: how it walks on stairs and ramps, to start episodes there."""
+    job.make([job.plan.gaits()], {"gaits"})

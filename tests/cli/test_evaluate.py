@@ -1,0 +1,67 @@
+"""Evaluating, and what was measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from romnav.evaluation import rows
+from tests.cli.conftest import fails, romnav
+
+
+def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> None:
+    folder = project / "results" / "smoke" / "locomotion"
+    assert fails("eval", "locomotion") == (
+        f"{folder}: no locomotion policy; train one with `romnav train locomotion --scale smoke`"
+    )
+    assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no locomotion policy; train one with")
+
+
+def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
+    assert "policy rom, seed 0 is not trained; run `romnav train policy rom`" in fails("eval", "rom")
+
+
+def test_results_are_printed_for_people_and_for_scripts(evaluated: Path) -> None:
+    data = json.loads(romnav("results", "--json").stdout)
+    assert data["scale"] == "smoke"
+    assert {run["arm"] for run in data["arms"]} == {"rom", "uniform", "nocap", "oracle", "straight"}
+    text = romnav("results").stdout
+    assert "uniform" in text
+    assert data["episode_set"] in text
+
+
+def test_results_before_any_evaluation_are_an_error(project: Path) -> None:
+    assert "no arm has been evaluated" in fails("results")
+
+
+def test_rows_of_different_episode_sets_are_not_compared(
+    evaluated: Path, episode_rows: Callable[..., rows.EpisodeRows]
+) -> None:
+    file = evaluated / "results" / "smoke" / "uniform" / "seed-0" / "episodes.parquet"
+    rows.write(file, episode_rows("uniform", episode_set="another"))
+    assert "rows of different episode sets" in fails("results")
+
+
+@pytest.mark.parametrize(
+    ("band", "code", "message"),
+    [
+        ([0, 100], 0, "rom sr_45"),
+        ([100, 100], 1, "rom sr_45 "),
+        (None, 1, "no readable file of bands"),
+    ],
+)
+def test_check_names_the_metric_outside_of_its_band(
+    evaluated: Path, band: list[int] | None, code: int, message: str
+) -> None:
+    if band:
+        file = evaluated / "results" / "smoke" / "bands.json"
+        file.write_text(json.dumps({"rom": {"sr_45": band, "spl": [0, 1]}}))
+    result = romnav("check")
+    assert result.exit_code == code
+    assert message in (result.stderr if code else result.stdout)
+    if band and code:
+        assert "1 of 2 metrics outside" in result.stderr
+        assert "band 100 to 100" in result.stderr
