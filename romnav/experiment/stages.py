@@ -350,7 +350,7 @@ class Stages:
 
     def world(self, spec: WorldSpec, progress: Progress | None = None) -> World:
         """Terrain, from the cache if it was built before."""
-        from romnav.world.world import build
+        from romnav.world.build import build
 
         return build(spec, self._worlds, progress)
 
@@ -372,7 +372,7 @@ class Stages:
     def _lidar(self, settings: Scale, tiles: Sequence[Tile]) -> Lidar:
         from romnav.sensing.lidar import Lidar
 
-        return Lidar([tile.solids for tile in tiles], settings.lidar, self.device)
+        return Lidar([tile.solids for tile in tiles], settings.lidar, self.device, self._worlds)
 
     def _sensor(self, stage: Stage, settings: Scale, tiles: Sequence[Tile]) -> Lidar | DepthCamera:
         if stage.sensor == "lidar":

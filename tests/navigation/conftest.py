@@ -9,8 +9,9 @@ from torch import Tensor
 from romnav.navigation.spec import EnvSpec, NavigationSpec, PolicySpec, PPOSpec
 from romnav.sensing.encoder import Encoder, untrained
 from romnav.sensing.spec import EncoderSpec
+from romnav.world.build import build
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 TOKENS = (4, 8)
 
