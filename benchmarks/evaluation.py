@@ -22,7 +22,6 @@ from romnav.evaluation.rollout import Policy, evaluate
 from romnav.evaluation.spec import EpisodeSetSpec
 from romnav.experiment.scales import Scale
 from romnav.navigation import checkpoint
-from romnav.navigation.perception import LidarPerception
 from romnav.sensing import encoder as encoders
 from romnav.sensing.lidar import Lidar
 from romnav.world.world import World, build
@@ -34,9 +33,9 @@ def driver(s: Scale, world: World, backend: str, options: argparse.Namespace) ->
     """The policy to evaluate, seeing through ``backend``."""
     perception = sensors(s, world)
     if options.encoder:
-        perception = LidarPerception(perception.lidar, perception.corruption, encoders.load(options.encoder))
+        perception.lidar.encoder = encoders.load(options.encoder)
     spec = s.lidar.model_copy(update={"backend": backend})
-    perception.lidar = Lidar([tile.solids for tile in world.tiles], spec)
+    perception.lidar.sensor = Lidar([tile.solids for tile in world.tiles], spec)
     if not options.policy:
         return Policy(ours(s, world).algorithm.actor, perception)
     return Policy(checkpoint.load_actor(options.policy, perception.encoder), perception)

@@ -8,15 +8,14 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.scripted import straight_direction, walk
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.navigation.env import to_command
-from romnav.navigation.observations import goal_observation
-from romnav.navigation.perception import LidarPerception
+from romnav.navigation.observations import observe
+from romnav.navigation.perception import Perception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.dynamics import Body, Dynamics
@@ -75,7 +74,7 @@ class View:
 class Policy:
     """A trained policy, acting by the mean of its distributions."""
 
-    def __init__(self, actor: NavigationActor, perception: LidarPerception) -> None:
+    def __init__(self, actor: NavigationActor, perception: Perception) -> None:
         self.actor = actor
         self.perception = perception
         perception.images = actor.encoder is not None
@@ -83,16 +82,10 @@ class Policy:
 
     def command(self, view: View) -> Tensor:
         """(A, 3) velocity command."""
-        r = view.robot
-        goal = goal_observation(r.position, r.yaw, view.goal_position, view.goal_yaw, view.env.max_goal_distance)
+        goal = view.goal_position, view.goal_yaw
         counters = torch.stack([view.noise, torch.full_like(view.noise, view.step)], dim=1)
-        obs = TensorDict(
-            {
-                "lidar": self.perception(r.tile, r.position, r.yaw, counters),
-                "state": torch.cat([goal, view.previous], dim=1),
-            },
-            batch_size=[len(view.episode)],
-        )
+        d_max = view.env.max_goal_distance
+        obs = observe(view.robot, *goal, view.previous, counters, self.perception, d_max)
         return to_command(self.actor(obs), view.env.command)
 
     def select(self, keep: Tensor) -> None:
