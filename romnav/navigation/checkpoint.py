@@ -54,8 +54,8 @@ def load_actor(
 ) -> NavigationActor:
     """The policy of ``path`` for the tokens of ``encoder`` and ``depth_encoder``, in evaluation mode.
 
-    One that trained its encoder has a copy of ``encoder`` with its own weights. One without a depth camera reads nothing
-    of ``depth_encoder``.
+    One that trained its encoder has a copy of ``encoder`` with its own weights. One without a depth camera needs no
+    ``depth_encoder``.
 
     Raises:
         RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec.

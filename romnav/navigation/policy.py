@@ -152,9 +152,9 @@ class Attention(nn.Module):
 class NavigationActor(MLPModel):
     """rsl-rl actor: attention over LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
 
-    In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts. It reads as
-    much of the observations as those that it was made for had: one for the reduced-order model also drives a humanoid.
-    What a humanoid has in addition, proprioception and depth, comes last in every layer that reads it.
+    In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts. Of the
+    observations it reads as much as those had that it was made for: one for the reduced-order model drives a humanoid,
+    too. What a humanoid has in addition, proprioception and depth, comes last in every layer that reads it.
     """
 
     is_recurrent = True

@@ -21,8 +21,8 @@ _ARM_GROUP = 5
 class OwnArms:
     """Pixels that the fixed arms hide, tabulated over the torso's tilt.
 
-    A camera turns with the torso and the arms, so its table has one entry. The LiDAR's image is levelled: against it the
-    arms move as the torso tilts.
+    A camera turns with the torso and the arms, so its table has one entry. The LiDAR's image is levelled: the arms move
+    in it as the torso tilts.
 
     Args:
         robot: The arms are its visual meshes, at its elbow angle.

@@ -22,6 +22,7 @@ from romnav.precision import reduced_precision
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train as train_locomotion
+from romnav.robot.rom import ReducedOrderModel
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
 from romnav.world.spec import SamplerSpec, WorldSpec
 from romnav.world.world import World, build
