@@ -14,6 +14,7 @@ from torch import Tensor
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.scripted import straight_direction, walk
 from romnav.evaluation.spec import EvaluationSpec
+from romnav.evaluation.tracks import Recorder
 from romnav.navigation.env import to_command
 from romnav.navigation.observations import goal_observation
 from romnav.navigation.perception import LidarPerception
@@ -138,8 +139,9 @@ def evaluate(
     spec: EvaluationSpec,
     progress: Progress | None = None,
     body: Body = ReducedOrderModel,
+    recorder: Recorder | None = None,
 ) -> dict[str, NDArray]:
-    """Drive all ``episodes`` once on robots that ``body`` makes.
+    """Drive all ``episodes`` once on robots that ``body`` makes, and let ``recorder`` keep their tracks.
 
     An episode ends at success, at a fall or after ``spec.duration``.
 
@@ -147,7 +149,7 @@ def evaluate(
         One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
     """
     with torch_threads(spec.threads):
-        return _evaluate(driver, world, episodes, env, spec, progress, body)
+        return _evaluate(driver, world, episodes, env, spec, progress, body, recorder)
 
 
 def _evaluate(
@@ -158,10 +160,13 @@ def _evaluate(
     spec: EvaluationSpec,
     progress: Progress | None,
     body: Body,
+    recorder: Recorder | None,
 ) -> dict[str, NDArray]:
     view = View(world, episodes, env, body(world, len(episodes), env.period))
     outcomes = Outcomes(view, spec.duration, spec.reach)
     collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
+    if recorder:
+        recorder.add(view, outcomes.alive())
     for step in outcomes.steps(progress):
         robot = view.robot
         command = driver.command(view)
@@ -170,6 +175,8 @@ def _evaluate(
         view.previous = command
         view.step = step
         collisions[view.episode] += ((robot.contacts > 0) & outcomes.alive()).long()
+        if recorder:
+            recorder.add(view, outcomes.alive())
         outcomes.add(before)
         # dropping rows costs copies: do it once a quarter of the batch is idle
         if 0 < outcomes.left < 0.75 * len(view.episode):
