@@ -17,9 +17,9 @@ import scipy.stats
 from _common import arguments, report, take_turns
 from numpy.typing import NDArray
 
-from romnav.evaluation.metrics import LEVELS, METRICS, in_level, quantities
-from romnav.evaluation.rows import HORIZONS, Arm, EpisodeRows, Provenance
-from romnav.evaluation.statistics import Bootstrap
+from romnav.evaluation.paired.metrics import LEVELS, METRICS, in_level, quantities
+from romnav.evaluation.paired.rows import HORIZONS, Arm, EpisodeRows, Provenance
+from romnav.evaluation.paired.statistics import Bootstrap
 
 RESAMPLES = 10_000
 EPISODES = 1024

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from romnav.evaluation import rows, trial_rows
+from romnav.evaluation.paired import rows
+from romnav.evaluation.trials import rows as trial_rows
 
 
 def _episode_rows(

@@ -112,7 +112,7 @@ def _evaluate_locomotion(job: DeviceJob) -> None:
 
 
 def _collect(at: AtScale) -> dict[str, Any]:
-    from romnav.report.results import collect
+    from romnav.report.paired.results import collect
 
     return collect(at.project.results, at.plan.scale.name)
 

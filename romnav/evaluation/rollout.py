@@ -13,6 +13,7 @@ from torch import Tensor
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.scripted import straight_direction, walk
 from romnav.evaluation.spec import EvaluationSpec
+from romnav.evaluation.tracks import Recorder
 from romnav.navigation.env import to_command
 from romnav.navigation.observations import observe
 from romnav.navigation.perception import Perception
@@ -131,8 +132,9 @@ def evaluate(
     spec: EvaluationSpec,
     progress: Progress | None = None,
     body: Body = ReducedOrderModel,
+    recorder: Recorder | None = None,
 ) -> dict[str, NDArray]:
-    """Drive all ``episodes`` once on robots that ``body`` makes.
+    """Drive all ``episodes`` once on robots that ``body`` makes, and let ``recorder`` keep their tracks.
 
     An episode ends at success, at a fall or after ``spec.duration``.
 
@@ -140,7 +142,7 @@ def evaluate(
         One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
     """
     with torch_threads(spec.threads):
-        return _evaluate(driver, world, episodes, env, spec, progress, body)
+        return _evaluate(driver, world, episodes, env, spec, progress, body, recorder)
 
 
 def _evaluate(
@@ -151,10 +153,13 @@ def _evaluate(
     spec: EvaluationSpec,
     progress: Progress | None,
     body: Body,
+    recorder: Recorder | None,
 ) -> dict[str, NDArray]:
     view = View(world, episodes, env, body(world, len(episodes), env.period))
     outcomes = Outcomes(view, spec.duration, spec.reach)
     collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
+    if recorder:
+        recorder.add(view, outcomes.alive())
     for step in outcomes.steps(progress):
         robot = view.robot
         command = driver.command(view)
@@ -163,6 +168,8 @@ def _evaluate(
         view.previous = command
         view.step = step
         collisions[view.episode] += ((robot.contacts > 0) & outcomes.alive()).long()
+        if recorder:
+            recorder.add(view, outcomes.alive())
         outcomes.add(before)
         # dropping rows costs copies: do it once a quarter of the batch is idle
         if 0 < outcomes.left < 0.75 * len(view.episode):

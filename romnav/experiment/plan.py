@@ -283,7 +283,7 @@ class Plan:
         Raises:
             RomnavError: There is no such experiment or table, or its arms are invalid.
         """
-        from romnav.report.tables import SPECS
+        from romnav.report.paired.tables import SPECS
 
         experiment = self.project.experiment(name)
         known = {spec.name for spec in SPECS}

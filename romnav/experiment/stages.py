@@ -19,8 +19,8 @@ from romnav.experiment.spec import SCRIPTED, Experiment
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
+    from romnav.evaluation.paired.rows import Provenance
     from romnav.evaluation.rollout import Driver
-    from romnav.evaluation.rows import Provenance
     from romnav.navigation.perception import Eye, Perception
     from romnav.robot.dynamics import Body
     from romnav.sensing.depth import DepthCamera
@@ -191,7 +191,8 @@ class Stages:
 
     def episodes(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Evaluates an arm on the paired episodes."""
-        from romnav.evaluation import episodes, rollout, rows
+        from romnav.evaluation import episodes, rollout
+        from romnav.evaluation.paired import rows
 
         settings = cast(Scale, stage.settings)
         paired = episodes.load(self.plan.episode_set)
@@ -217,7 +218,8 @@ class Stages:
 
     def trials(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Drives an arm through the scenes of an experiment, with the safety filter off and on."""
-        from romnav.evaluation import trial_rows, trials
+        from romnav.evaluation.trials import rows as trial_rows
+        from romnav.evaluation.trials import run as trials
         from romnav.world.scenes.scene import scene_world
 
         settings = cast(Scale, stage.settings)
@@ -233,8 +235,9 @@ class Stages:
 
     def tables(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Writes the tables of an experiment from the recorded rows."""
-        from romnav.evaluation.statistics import Bootstrap
-        from romnav.report import formats, results, tables
+        from romnav.evaluation.paired.statistics import Bootstrap
+        from romnav.report import formats
+        from romnav.report.paired import results, tables
 
         arms = results.load(self.plan.project.results, self.plan.scale.name)
         bootstrap = Bootstrap(arms)
@@ -269,8 +272,10 @@ class Stages:
 
     def report(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Writes the table and draws the figure of an experiment that consists of trials, of those that are there."""
-        from romnav.evaluation import trial_rows
-        from romnav.report import formats, trial_pictures, trial_tables
+        from romnav.evaluation.trials import rows as trial_rows
+        from romnav.report import formats
+        from romnav.report.trials import pictures as trial_pictures
+        from romnav.report.trials import tables as trial_tables
 
         experiment = cast(Experiment, stage.settings)
         files = [above.folder / above.outputs[0] for above in stage.upstream]
@@ -327,7 +332,7 @@ class Stages:
 
     def _provenance(self, stage: Stage, episode_set: str) -> Provenance:
         """Where the rows of a stage come from."""
-        from romnav.evaluation.rows import Provenance
+        from romnav.evaluation.paired.rows import Provenance
 
         facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
         policy = None

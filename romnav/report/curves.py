@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from romnav.errors import RomnavError
-from romnav.evaluation.statistics import Estimate
+from romnav.evaluation.paired.statistics import Estimate
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from romnav.cli import app
-from romnav.evaluation import rows
+from romnav.evaluation.paired import rows
 
 ROOT = Path(__file__).parents[2]
 

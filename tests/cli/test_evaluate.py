@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from romnav.evaluation import rows
+from romnav.evaluation.paired import rows
 from tests.cli.conftest import fails, romnav
 
 

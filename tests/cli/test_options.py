@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from romnav import __version__
-from romnav.evaluation import rows
+from romnav.evaluation.paired import rows
 from tests.cli.conftest import ROOT, fails, romnav
 
 

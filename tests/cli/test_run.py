@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from romnav.evaluation import rows, trial_rows
+from romnav.evaluation.paired import rows
+from romnav.evaluation.trials import rows as trial_rows
 from romnav.experiment import launch, stages
 from tests.cli.conftest import edit, fails, romnav
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from romnav.errors import RomnavError
-from romnav.evaluation import metrics, rows
-from romnav.evaluation.statistics import Bootstrap
+from romnav.evaluation.paired import metrics, rows
+from romnav.evaluation.paired.statistics import Bootstrap
 
 ROWS_FILE = "episodes.parquet"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from romnav.errors import RomnavError
-from romnav.evaluation import metrics, rows
-from romnav.report import results
+from romnav.evaluation.paired import metrics, rows
+from romnav.report.paired import results
 
 
 @pytest.fixture

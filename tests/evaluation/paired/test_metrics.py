@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from romnav.evaluation import metrics, rows
+from romnav.evaluation.paired import metrics, rows
 
 
 def columns(**changes: object) -> dict[str, np.ndarray]:

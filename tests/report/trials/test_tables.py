@@ -6,8 +6,9 @@ import re
 
 import pytest
 
-from romnav.evaluation.trial_statistics import closed_routes, summarise
-from romnav.report import formats, trial_tables
+from romnav.evaluation.trials.statistics import closed_routes, summarise
+from romnav.report import formats
+from romnav.report.trials import tables as trial_tables
 from romnav.world.scenes.deployments import deployment_scenes
 from romnav.world.scenes.obstacles import obstacle_scenes
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from romnav.evaluation import trials
 from romnav.evaluation.rollout import Oracle, Straight, View
 from romnav.evaluation.spec import TrialSpec
+from romnav.evaluation.trials import run as trials
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.body import BodyModel
 from romnav.safety.filter import Status

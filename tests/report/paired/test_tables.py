@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from romnav.errors import RomnavError
-from romnav.evaluation import metrics, rows
-from romnav.evaluation.statistics import Bootstrap
-from romnav.report import formats, paper, tables
+from romnav.evaluation.paired import metrics, rows
+from romnav.evaluation.paired.statistics import Bootstrap
+from romnav.report import formats, paper
+from romnav.report.paired import tables
 
 SKILLS = {
     "rom": 0.95,

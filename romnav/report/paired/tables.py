@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from romnav.errors import RomnavError
-from romnav.evaluation.metrics import Level
-from romnav.evaluation.rows import HORIZONS, Arm
-from romnav.evaluation.statistics import Bootstrap
+from romnav.evaluation.paired.metrics import Level
+from romnav.evaluation.paired.rows import HORIZONS, Arm
+from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from romnav.errors import RomnavError
-from romnav.evaluation import trial_rows
+from romnav.evaluation.trials import rows as trial_rows
 
 
 def test_rows_survive_the_disk(trial_run, tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_what_cannot_be_is_one_clear_error(trial_run, tmp_path: Path) -> None:
 
 
 def test_other_files_are_refused(episode_rows, tmp_path: Path) -> None:
-    from romnav.evaluation import rows
+    from romnav.evaluation.paired import rows
 
     rows.write(tmp_path / "episodes.parquet", episode_rows())
     with pytest.raises(RomnavError, match="schema version none"):

@@ -6,8 +6,8 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from romnav.evaluation.trial_rows import TrialRows
-from romnav.evaluation.trial_statistics import (
+from romnav.evaluation.trials.rows import TrialRows
+from romnav.evaluation.trials.statistics import (
     Difference,
     Event,
     Summary,

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from romnav.errors import RomnavError
-from romnav.evaluation import rows
+from romnav.evaluation.paired import rows
 
 
 def test_written_rows_are_read_back(episode_rows, tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_reading_does_not_import_pandas(episode_rows, tmp_path: Path) -> None:
     path = tmp_path / "rows"
     rows.write(path, episode_rows())
     script = (
-        "import sys; from pathlib import Path; from romnav.report import results, tables; "
+        "import sys; from pathlib import Path; from romnav.report.paired import results, tables; "
         f"results.rows.read(Path({str(path)!r})); "
         "sys.exit(bool({'pandas', 'torch', 'warp', 'mujoco'} & set(sys.modules)))"
     )

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from romnav import files
 from romnav.errors import RomnavError
-from romnav.evaluation.rows import OUTCOMES, Provenance
+from romnav.evaluation.paired.rows import OUTCOMES, Provenance
 
 SCHEMA_VERSION = 1
 _POSES = [f"{end}_{axis}" for end in ("spawn", "goal") for axis in ("x", "y", "z", "yaw")]

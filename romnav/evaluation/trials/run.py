@@ -152,7 +152,7 @@ def run(
     The driver's memory of its previous command is its own, not the filtered one.
 
     Returns:
-        One array (2 x scenes x trials,) per column of `romnav.evaluation.trial_rows` that a run measures.
+        One array (2 x scenes x trials,) per column of `romnav.evaluation.trials.rows` that a run measures.
     """
     with torch_threads(spec.threads):
         episodes = draw(scenes, world, spec)

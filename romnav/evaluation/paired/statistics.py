@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from romnav.errors import RomnavError
-from romnav.evaluation.metrics import LEVELS, METRICS, Level, Metric, in_level, quantities
-from romnav.evaluation.rows import HORIZONS, Arm
+from romnav.evaluation.paired.metrics import LEVELS, METRICS, Level, Metric, in_level, quantities
+from romnav.evaluation.paired.rows import HORIZONS, Arm
 
 Cluster = Literal["episode", "tile"]
 _DISJOINT: tuple[Level, ...] = ("same", "cross")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from romnav.evaluation.trial_statistics import closed_routes, difference, held_trials, summarise
+from romnav.evaluation.trials.statistics import closed_routes, difference, held_trials, summarise
 
 
 def test_summary_counts_the_rows(trial_run) -> None:

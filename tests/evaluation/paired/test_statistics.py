@@ -8,8 +8,8 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from romnav.evaluation import metrics, rows
-from romnav.evaluation.statistics import Bootstrap, mcnemar_mid_p, resampled_sums, wilson
+from romnav.evaluation.paired import metrics, rows
+from romnav.evaluation.paired.statistics import Bootstrap, mcnemar_mid_p, resampled_sums, wilson
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from romnav.evaluation.statistics import mcnemar_mid_p, resampled_sums, wilson
-from romnav.evaluation.trial_rows import TrialRows
+from romnav.evaluation.paired.statistics import mcnemar_mid_p, resampled_sums, wilson
+from romnav.evaluation.trials.rows import TrialRows
 
 Event = Literal["success", "collision"]
 

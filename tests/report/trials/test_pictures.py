@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from romnav.report import trial_pictures
 from romnav.report.pictures import COLOURS, project, render
+from romnav.report.trials import pictures as trial_pictures
 from romnav.world.scenes.deployments import deployment_scenes
 from romnav.world.scenes.obstacles import obstacle_scenes
 from romnav.world.solids import Label, SolidsBuilder

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from romnav.evaluation.rows import HORIZONS, SUCCESS_RADIUS
+from romnav.evaluation.paired.rows import HORIZONS, SUCCESS_RADIUS
 
 Level = Literal["all", "same", "cross"]
 LEVELS: tuple[Level, ...] = ("all", "same", "cross")

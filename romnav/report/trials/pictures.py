@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
-from romnav.evaluation.trial_rows import TrialRows
-from romnav.evaluation.trial_statistics import closed_routes, held_trials, summarise
+from romnav.evaluation.trials.rows import TrialRows
+from romnav.evaluation.trials.statistics import closed_routes, held_trials, summarise
 from romnav.report.pictures import project, render
 from romnav.world.scenes.scene import Scene
 

@@ -1,0 +1,1 @@
+"""Paired episodes: every arm walks the same ones (paper, Sec. IV-A)."""

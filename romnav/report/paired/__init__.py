@@ -1,0 +1,1 @@
+"""Tables and listings of paired episodes."""
