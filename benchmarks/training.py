@@ -200,11 +200,11 @@ class Stopwatch:
 def shares(learner: Learner, iterations: int) -> dict[str, float]:
     """Share of the time of each part."""
     env: NavigationEnv = learner.env
-    ppo, perception, watch = learner.algorithm, env.perception, Stopwatch()
+    ppo, eye, watch = learner.algorithm, env.perceive.lidar, Stopwatch()
     actor: NavigationActor = ppo.actor
-    watch.wrap(perception.lidar, "scan", "LiDAR")
-    watch.wrap(perception, "corruption", "corruption")
-    watch.wrap(perception.encoder, "tokens", "encoder")
+    watch.wrap(eye.sensor, "scan", "LiDAR")
+    watch.wrap(eye, "corruption", "corruption")
+    watch.wrap(eye.encoder, "tokens", "encoder")
     watch.wrap(env.dynamics, "step", "dynamics")
     watch.wrap(env, "_lookup", "geodesic lookup")
     watch.wrap(env, "_reset", "resets")
