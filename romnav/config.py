@@ -6,6 +6,8 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Config(BaseModel):
-    """Typed, immutable configuration: unknown keys are errors, numbers are not coerced from strings."""
+    """Typed, immutable configuration: unknown keys are errors, numbers are finite and not coerced from strings."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )

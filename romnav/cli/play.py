@@ -14,7 +14,7 @@ from romnav.cli.options import AtScale, command
 @command(play, "world")
 def world(
     at: AtScale,
-    seed: Annotated[int, typer.Option(help="Seed of the generator.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the generator.")] = 0,
     tile: Annotated[int, typer.Option(min=0, help="Which tile of that seed; the classes take turns.")] = 0,
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
 ) -> None:

@@ -25,7 +25,7 @@ class EpisodeSetSpec(Config):
     """Of them across levels (P, derived: the paper's contrasts and totals fit no other share)."""
     sampler: SamplerSpec = SamplerSpec(stair_probability=0.0)
     """Spawns uniform over free cells off stairs and mouths, where a humanoid can stand; goals as in training (A)."""
-    seed: int = 3000
+    seed: int = Field(default=3000, ge=0)
     """Seed of the draw."""
 
     @model_validator(mode="after")
@@ -59,7 +59,7 @@ class TrialSpec(Config):
     """Distance to the goal that is success, in 3D, m (P)."""
     heading: float = Field(default=math.pi / 4, ge=0.0)
     """Largest angle at the start between heading and shortest path, rad (A)."""
-    seed: int = 1000
+    seed: int = Field(default=1000, ge=0)
     """Seed of starts, goals and sensor noise."""
     dynamics: Literal["body"] = "body"
     """What is driven: the reduced-order model with a body that touches the exact solids."""

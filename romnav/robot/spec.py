@@ -251,7 +251,7 @@ class LocomotionSpec(Config):
     ppo: PpoSpec = PpoSpec()
     iterations: int = 4000
     """PPO iterations."""
-    seed: int = 1
+    seed: int = Field(default=1, ge=0)
     """Of everything random."""
 
     def steps(self, iteration: int) -> int:

@@ -117,7 +117,7 @@ class PretrainSpec(Config):
     """Weight of the Kullback-Leibler term (A: at 1, the evidence lower bound itself, stairs are learned far later)."""
     free_bits: float = 0.5
     """Divergence that each latent dimension has for free, nat (A)."""
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
     """Seed of weights, poses and corruption."""
 
 
@@ -160,5 +160,5 @@ class QualitySpec(Config):
     """Images, posed as in training (A: a per-mille of a class moves its IoU by less than the seed does)."""
     tiles: int = Field(default=64, ge=1)
     """Tiles (A)."""
-    seed: int = 1000
+    seed: int = Field(default=1000, ge=0)
     """Seed of the tiles; training uses another (P)."""

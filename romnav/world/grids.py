@@ -89,7 +89,7 @@ def rasterise(tile: Tile, spec: GridSpec) -> Grids:
             higher = (inside <= 0.0) & ~(z <= h)
             h[higher], top[higher] = z[higher], s
     free = ~np.isnan(height)
-    for layer in range(layers):
+    for layer in np.flatnonzero(free.any(axis=(1, 2))).tolist():
         free[layer] &= ~_blocked_by_solids(tile.solids, layer, height[layer], surface[layer], centres, spec)
         free[layer] &= _edge_distance(height[layer], spec) >= spec.robot_radius
     return _number_nodes(tile, spec, centres, height, surface, free)

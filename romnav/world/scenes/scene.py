@@ -69,7 +69,8 @@ def scene_world(scenes: Sequence[Scene]) -> World:
         if not (start.any() and goal.any()):
             raise RomnavError(f"scene {scene.name}: {'its goal' if start.any() else 'its start'} has no free cell")
         goals.append(np.flatnonzero(goal | (start & scene.both_ways)))
-    spec = WorldSpec(tiles=len(scenes), side=sides.pop(), grid=PLANNING)
+    # scenes are not generated: the least sides of the tile classes are nothing to them
+    spec = WorldSpec(tiles=len(scenes), grid=PLANNING).model_copy(update={"side": sides.pop()})
     return pack(spec, [scene.tile for scene in scenes], grids, goals)
 
 

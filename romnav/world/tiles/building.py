@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from romnav.errors import RomnavError
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Connector, Tile, TileClass
 from romnav.world.tiles.furniture import HALL, ROOM, furnish
-from romnav.world.tiles.site import Floor, Frame, Span, block, cut, edges
+from romnav.world.tiles.site import MAX_FITS, Floor, Frame, Span, block, cut, edges
 from romnav.world.tiles.stairs import KERB, SLAB, Railing, Staircase, add_railing, draw_ramp, draw_stair
 
 WALL = 0.15
@@ -116,12 +117,14 @@ def _draw_plan(rng: np.random.Generator, spec: WorldSpec, index: int) -> Plan:
     spans = _spans(rng, storeys, relay=lot < RELAY)
     lengths, depths = TOWER if (0, 2) in spans else WING
     room = spec.side - 0.6
-    while True:
+    for _ in range(MAX_FITS):
         yaw = float(rng.uniform(-0.35, 0.35)) if rng.random() < 0.4 else 0.0
         length, depth = (min(float(rng.uniform(*x)), room) for x in (lengths, depths))
         c, s = np.cos(yaw), abs(np.sin(yaw))
         if max(length * c + depth * s, length * s + depth * c) <= room:
             break
+    else:
+        raise RomnavError(f"world.side: no building fits into {spec.side} m; widen it")
     quarter = float(rng.integers(4)) * np.pi / 2
     middle = Frame(spec.side / 2, spec.side / 2, yaw + quarter)
     frame = middle.sub(-length / 2, -depth / 2)

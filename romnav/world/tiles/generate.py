@@ -30,7 +30,7 @@ def generate(spec: WorldSpec, index: int) -> tuple[Tile, Grids]:
     """Generate tile ``index`` of ``spec``, a function of both alone: drawn until all of it is reachable.
 
     Raises:
-        RomnavError: an unknown class, or no draw passes (an impossible spec).
+        RomnavError: No draw passes (an impossible spec).
     """
     tile, grids, _ = generate_counted(spec, index)
     return tile, grids
@@ -38,18 +38,18 @@ def generate(spec: WorldSpec, index: int) -> tuple[Tile, Grids]:
 
 def generate_counted(spec: WorldSpec, index: int) -> tuple[Tile, Grids, int]:
     """As `generate`, and the number of draws that it took."""
-    name = spec.classes[index % len(spec.classes)]
-    if name not in list(TileClass):
-        raise RomnavError(f"world.classes: no tile class {name!r}; there are {', '.join(TileClass)}")
+    kind = TileClass(spec.classes[index % len(spec.classes)])
+    why = None
     for attempt in range(MAX_ATTEMPTS):
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([spec.seed, index, attempt])))
-        tile = GENERATORS[TileClass(name)](rng, spec, index)
+        tile = GENERATORS[kind](rng, spec, index)
         grids = rasterise(tile, spec.grid)
-        if fault(tile, grids) is None:
+        why = fault(tile, grids)
+        if why is None:
             return tile, grids, attempt + 1
     raise RomnavError(
-        f"world: no {name} tile passed the reachability check in {MAX_ATTEMPTS} draws "
-        f"(seed {spec.seed}, index {index}); widen world.side or the riser and tread ranges"
+        f"world: no {kind} tile passed the reachability check in {MAX_ATTEMPTS} draws "
+        f"(seed {spec.seed}, index {index}; {why}); widen world.side or steepen the riser and tread ranges"
     )
 
 

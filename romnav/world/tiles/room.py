@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
+from romnav.errors import RomnavError
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Connector, Tile, TileClass
 from romnav.world.tiles.furniture import CLUTTER, furnish
-from romnav.world.tiles.site import Floor, Frame, block
+from romnav.world.tiles.site import MAX_FITS, Floor, Frame, block
 from romnav.world.tiles.stairs import MOUTH, Railing, add_flight, add_railing, draw_ramp, draw_stair
 
 WALL = 0.2
+LEAST = 70.0
+"""Least area of a room, m^2."""
 
 
 def room(rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
     """A hall of up to the tile's size, rotated, with furniture, screens and often a stage."""
     solids, floor = SolidsBuilder(), Floor(spec.side)
     most = spec.side - 0.4
-    while True:
+    for _ in range(MAX_FITS):
         yaw = float(rng.uniform(-np.pi / 4, np.pi / 4)) if rng.random() < 0.5 else 0.0
         length, depth = float(rng.uniform(0.45, 1.0)) * most, float(rng.uniform(0.4, 0.95)) * most
         c, s = np.cos(yaw), abs(np.sin(yaw))
-        if max(length * c + depth * s, length * s + depth * c) <= most and length * depth > 70.0:
+        if max(length * c + depth * s, length * s + depth * c) <= most and length * depth > LEAST:
             break
+    else:
+        raise RomnavError(f"world.side: no room of {LEAST:.0f} m^2 fits into {spec.side} m; widen it")
     middle = Frame(spec.side / 2, spec.side / 2, yaw + float(rng.integers(4)) * np.pi / 2)
     frame = middle.sub(-length / 2, -depth / 2)
     block(solids, frame, (0.0, length), (0.0, depth), (-0.2, 0.0), label=Label.GROUND, layers=(0, 0))

@@ -11,6 +11,9 @@ from romnav.world.solids import Label, SolidsBuilder
 
 Span = tuple[float, float]
 
+MAX_FITS = 1000
+"""Outlines of a building or room that are drawn until one fits into the tile."""
+
 
 @dataclass(frozen=True)
 class Frame:
