@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.rollout import Driver, Outcomes, View
 from romnav.evaluation.spec import EvaluationSpec
+from romnav.evaluation.tracks import Recorder
 from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
 from romnav.robot.dynamics import Body
@@ -25,8 +26,9 @@ def run(
     spec: EvaluationSpec,
     progress: Progress | None = None,
     body: Body = ReducedOrderModel,
+    recorder: Recorder | None = None,
 ) -> dict[str, NDArray]:
-    """Drive all ``episodes`` once on robots that ``body`` makes.
+    """Drive all ``episodes`` once on robots that ``body`` makes, and let ``recorder`` keep their tracks.
 
     An episode ends at success, at a fall or after ``spec.duration``.
 
@@ -34,7 +36,7 @@ def run(
         One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
     """
     with torch_threads(spec.threads):
-        return _run(driver, world, episodes, env, spec, progress, body)
+        return _run(driver, world, episodes, env, spec, progress, body, recorder)
 
 
 def _run(
@@ -45,10 +47,13 @@ def _run(
     spec: EvaluationSpec,
     progress: Progress | None,
     body: Body,
+    recorder: Recorder | None,
 ) -> dict[str, NDArray]:
     view = View(world, episodes, env, body(world, len(episodes), env.period))
     outcomes = Outcomes(view, spec.duration, spec.reach)
     collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
+    if recorder:
+        recorder.add(view, outcomes.alive())
     for step in outcomes.steps(progress):
         robot = view.robot
         command = driver.command(view)
@@ -57,6 +62,8 @@ def _run(
         view.previous = command
         view.step = step
         collisions[view.episode] += ((robot.contacts > 0) & outcomes.alive()).long()
+        if recorder:
+            recorder.add(view, outcomes.alive())
         outcomes.add(before)
         # dropping rows costs copies: do it once a quarter of the batch is idle
         if 0 < outcomes.left < 0.75 * len(view.episode):
