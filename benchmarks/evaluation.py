@@ -18,7 +18,8 @@ from _learner import CACHE, ours, scale, sensors
 from numpy.typing import NDArray
 
 from romnav.evaluation import episodes
-from romnav.evaluation.rollout import Policy, evaluate
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Policy
 from romnav.evaluation.spec import EpisodeSetSpec
 from romnav.experiment.scales import Scale
 from romnav.navigation import checkpoint
@@ -67,7 +68,7 @@ def main() -> None:
     for backend in ("columns", "mesh") if options.policy else ("columns",):
         policy = driver(s, world, backend, options)
         start = time.perf_counter()
-        measured = evaluate(policy, world, drawn, s.navigation.env, s.evaluation)
+        measured = run(policy, world, drawn, s.navigation.env, s.evaluation)
         times[backend] = [time.perf_counter() - start]
         success[backend] = measured["outcome"] == "success"
     own = times.pop("columns")

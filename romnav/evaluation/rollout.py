@@ -1,8 +1,8 @@
-"""Paired evaluation: every arm walks the same episodes, one row each (paper, Sec. IV-A)."""
+"""Driving robots through episodes: what a driver sees, and how episodes end."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
@@ -12,20 +12,16 @@ from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.scripted import straight_direction, walk
-from romnav.evaluation.spec import EvaluationSpec
-from romnav.evaluation.tracks import Recorder
 from romnav.navigation.env import to_command
 from romnav.navigation.observations import observe
 from romnav.navigation.perception import Perception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.spec import EnvSpec
-from romnav.robot.dynamics import Body, Dynamics
+from romnav.progress import Progress
+from romnav.robot.dynamics import Dynamics
 from romnav.robot.rom import ReducedOrderModel
-from romnav.threads import torch_threads
 from romnav.world.geodesic import GeodesicLookup
 from romnav.world.world import World
-
-Progress = Callable[[int, int, str], None]
 
 
 class Driver(Protocol):
@@ -121,62 +117,6 @@ class Straight:
 
 
 SCRIPTED: dict[str, type[Oracle] | type[Straight]] = {"oracle": Oracle, "straight": Straight}
-
-
-@torch.inference_mode()
-def evaluate(
-    driver: Driver,
-    world: World,
-    episodes: EpisodeSet,
-    env: EnvSpec,
-    spec: EvaluationSpec,
-    progress: Progress | None = None,
-    body: Body = ReducedOrderModel,
-    recorder: Recorder | None = None,
-) -> dict[str, NDArray]:
-    """Drive all ``episodes`` once on robots that ``body`` makes, and let ``recorder`` keep their tracks.
-
-    An episode ends at success, at a fall or after ``spec.duration``.
-
-    Returns:
-        One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
-    """
-    with torch_threads(spec.threads):
-        return _evaluate(driver, world, episodes, env, spec, progress, body, recorder)
-
-
-def _evaluate(
-    driver: Driver,
-    world: World,
-    episodes: EpisodeSet,
-    env: EnvSpec,
-    spec: EvaluationSpec,
-    progress: Progress | None,
-    body: Body,
-    recorder: Recorder | None,
-) -> dict[str, NDArray]:
-    view = View(world, episodes, env, body(world, len(episodes), env.period))
-    outcomes = Outcomes(view, spec.duration, spec.reach)
-    collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
-    if recorder:
-        recorder.add(view, outcomes.alive())
-    for step in outcomes.steps(progress):
-        robot = view.robot
-        command = driver.command(view)
-        before = robot.position[:, :2]
-        robot.step(command)
-        view.previous = command
-        view.step = step
-        collisions[view.episode] += ((robot.contacts > 0) & outcomes.alive()).long()
-        if recorder:
-            recorder.add(view, outcomes.alive())
-        outcomes.add(before)
-        # dropping rows costs copies: do it once a quarter of the batch is idle
-        if 0 < outcomes.left < 0.75 * len(view.episode):
-            keep = outcomes.alive().nonzero()[:, 0]
-            view.select(keep)
-            driver.select(keep)
-    return {**outcomes.columns(), "collisions": collisions.cpu().numpy()}
 
 
 class Outcomes:

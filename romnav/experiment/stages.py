@@ -19,8 +19,8 @@ from romnav.experiment.spec import SCRIPTED, Experiment
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
-    from romnav.evaluation.paired.rows import Provenance
     from romnav.evaluation.rollout import Driver
+    from romnav.evaluation.rowfile import Provenance
     from romnav.navigation.perception import Eye, Perception
     from romnav.robot.dynamics import Body
     from romnav.sensing.depth import DepthCamera
@@ -191,8 +191,8 @@ class Stages:
 
     def episodes(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Evaluates an arm on the paired episodes."""
-        from romnav.evaluation import episodes, rollout
-        from romnav.evaluation.paired import rows
+        from romnav.evaluation import episodes
+        from romnav.evaluation.paired import rows, run
 
         settings = cast(Scale, stage.settings)
         paired = episodes.load(self.plan.episode_set)
@@ -200,7 +200,7 @@ class Stages:
         driver = self._driver(stage, world)
         spec = settings.evaluation
         body = self._body(stage, spec.threads)
-        measured = rollout.evaluate(driver, world, paired, settings.navigation.env, spec, progress, body)
+        measured = run.run(driver, world, paired, settings.navigation.env, spec, progress, body)
         provenance = self._provenance(stage, paired.digest)
         count = len(paired)
         columns: dict[str, Any] = {
@@ -332,7 +332,7 @@ class Stages:
 
     def _provenance(self, stage: Stage, episode_set: str) -> Provenance:
         """Where the rows of a stage come from."""
-        from romnav.evaluation.paired.rows import Provenance
+        from romnav.evaluation.rowfile import Provenance
 
         facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
         policy = None

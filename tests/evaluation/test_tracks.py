@@ -8,7 +8,8 @@ import torch
 
 from romnav.errors import RomnavError
 from romnav.evaluation import episodes, tracks
-from romnav.evaluation.rollout import Oracle, evaluate
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Oracle
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.navigation.spec import EnvSpec
 from romnav.world.spec import SamplerSpec, WorldSpec
@@ -27,7 +28,7 @@ def recorded() -> tuple[tracks.Tracks, dict, episodes.EpisodeSet]:
     world = build(SPEC.world)
     paired = episodes.draw("test", SPEC, world)
     recorder = tracks.Recorder()
-    out = evaluate(Oracle(), world, paired, EnvSpec(), EvaluationSpec(duration=20.0), recorder=recorder)
+    out = run(Oracle(), world, paired, EnvSpec(), EvaluationSpec(duration=20.0), recorder=recorder)
     return recorder.tracks(len(paired)), out, paired
 
 

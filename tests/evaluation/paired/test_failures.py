@@ -7,7 +7,8 @@ import torch
 from romnav.evaluation import episodes
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.paired.failures import classify, on_connector
-from romnav.evaluation.rollout import Oracle, Straight, View, evaluate
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Oracle, Straight, View
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.evaluation.tracks import Recorder
 from romnav.navigation.spec import EnvSpec
@@ -47,7 +48,7 @@ def paired(world: World) -> EpisodeSet:
 
 def failures(driver: object, world: World, paired: EpisodeSet, duration: float) -> tuple[np.ndarray, ...]:
     recorder = Recorder()
-    out = evaluate(driver, world, paired, EnvSpec(), EvaluationSpec(duration=duration), recorder=recorder)
+    out = run(driver, world, paired, EnvSpec(), EvaluationSpec(duration=duration), recorder=recorder)
     rows = {**out, "goal_z": paired.columns["goal_z"], "level": np.where(paired.cross, "cross", "same")}
     where, how = classify(recorder.tracks(len(paired)), rows, paired.columns["tile"], world, 0.2)
     assert ((where == "") == (out["outcome"] == "success")).all()
@@ -77,7 +78,7 @@ def test_who_walks_into_a_wall_pressed(world: World, paired: EpisodeSet) -> None
 def test_who_knows_the_way_was_on_a_stair_or_on_the_level(world: World, paired: EpisodeSet) -> None:
     """The oracle, stopped early, roams; where it has climbed it is on a stair or beyond."""
     recorder = Recorder()
-    out = evaluate(Oracle(), world, paired, EnvSpec(), EvaluationSpec(duration=12.0), recorder=recorder)
+    out = run(Oracle(), world, paired, EnvSpec(), EvaluationSpec(duration=12.0), recorder=recorder)
     rows = {**out, "goal_z": paired.columns["goal_z"], "level": np.where(paired.cross, "cross", "same")}
     tracks = recorder.tracks(len(paired))
     where, how = classify(tracks, rows, paired.columns["tile"], world, 0.2)
