@@ -11,8 +11,9 @@ import torch
 from _common import ROOT
 
 from romnav.experiment.scales import Scale, ScaleFile
-from romnav.navigation.env import NavigationEnv, Perception
-from romnav.navigation.perception import LidarPerception
+from romnav.navigation.env import NavigationEnv
+from romnav.navigation.observations import Perceive
+from romnav.navigation.perception import Eye, Perception
 from romnav.navigation.ppo import make_ppo
 from romnav.robot.rom import ReducedOrderModel
 from romnav.sensing.corruption import Corruption
@@ -39,19 +40,19 @@ def load_world(spec: WorldSpec, cache: Path = CACHE) -> World:
     return build(spec, cache)
 
 
-def sensors(s: Scale, world: World, *, bfloat16: bool = True) -> LidarPerception:
+def sensors(s: Scale, world: World, *, bfloat16: bool = True) -> Perception:
     """LiDAR, corruption and an encoder with random weights: what it computes costs the same as a trained one."""
     torch.manual_seed(0)
     lidar = Lidar([tile.solids for tile in world.tiles], s.lidar)
     spec = s.pretrain.encoder.model_copy(update={"bfloat16": bfloat16})
     encoder = Autoencoder(spec, lidar.directions).encoder.eval().requires_grad_(False)
-    return LidarPerception(lidar, Corruption(s.navigation.corruption, 0), encoder)
+    return Perception(Eye(lidar, Corruption(s.navigation.corruption, 0), encoder))
 
 
-def environment(s: Scale, world: World, perception: Perception) -> NavigationEnv:
-    """Robots on ``world`` that see through ``perception``."""
+def environment(s: Scale, world: World, perceive: Perceive) -> NavigationEnv:
+    """Robots on ``world`` that see through ``perceive``."""
     spec = s.navigation.env
-    return NavigationEnv(world, ReducedOrderModel(world, spec.envs, spec.period), perception, spec, 0, "cpu")
+    return NavigationEnv(world, ReducedOrderModel(world, spec.envs, spec.period), perceive, spec, 0, "cpu")
 
 
 class Learner:

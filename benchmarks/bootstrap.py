@@ -18,8 +18,9 @@ from _common import arguments, report, take_turns
 from numpy.typing import NDArray
 
 from romnav.evaluation.paired.metrics import LEVELS, METRICS, in_level, quantities
-from romnav.evaluation.paired.rows import HORIZONS, Arm, EpisodeRows, Provenance
+from romnav.evaluation.paired.rows import HORIZONS, Arm, EpisodeRows
 from romnav.evaluation.paired.statistics import Bootstrap
+from romnav.evaluation.rowfile import Provenance
 
 RESAMPLES = 10_000
 EPISODES = 1024

@@ -18,11 +18,11 @@ from _learner import CACHE, ours, scale, sensors
 from numpy.typing import NDArray
 
 from romnav.evaluation import episodes
-from romnav.evaluation.rollout import Policy, evaluate
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Policy
 from romnav.evaluation.spec import EpisodeSetSpec
 from romnav.experiment.scales import Scale
 from romnav.navigation import checkpoint
-from romnav.navigation.perception import LidarPerception
 from romnav.sensing import encoder as encoders
 from romnav.sensing.lidar import Lidar
 from romnav.world.build import build
@@ -35,9 +35,9 @@ def driver(s: Scale, world: World, backend: str, options: argparse.Namespace) ->
     """The policy to evaluate, seeing through ``backend``."""
     perception = sensors(s, world)
     if options.encoder:
-        perception = LidarPerception(perception.lidar, perception.corruption, encoders.load(options.encoder))
+        perception.lidar.encoder = encoders.load(options.encoder)
     spec = s.lidar.model_copy(update={"backend": backend})
-    perception.lidar = Lidar([tile.solids for tile in world.tiles], spec)
+    perception.lidar.sensor = Lidar([tile.solids for tile in world.tiles], spec)
     if not options.policy:
         return Policy(ours(s, world).algorithm.actor, perception)
     return Policy(checkpoint.load_actor(options.policy, perception.encoder), perception)
@@ -69,7 +69,7 @@ def main() -> None:
     for backend in ("columns", "mesh") if options.policy else ("columns",):
         policy = driver(s, world, backend, options)
         start = time.perf_counter()
-        measured = evaluate(policy, world, drawn, s.navigation.env, s.evaluation)
+        measured = run(policy, world, drawn, s.navigation.env, s.evaluation)
         times[backend] = [time.perf_counter() - start]
         success[backend] = measured["outcome"] == "success"
     own = times.pop("columns")

@@ -34,9 +34,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from romnav.experiment.scales import Scale
-from romnav.navigation.env import ACTIONS, NavigationEnv
-from romnav.navigation.perception import LidarPerception
+from romnav.navigation.env import NavigationEnv
+from romnav.navigation.observations import ACTIONS
+from romnav.navigation.perception import Perception
 from romnav.navigation.policy import LAYERS, NavigationActor, with_bearing
+from romnav.robot.dynamics import Dynamics
 from romnav.world.world import World
 
 SAME_ACTION = 0.02
@@ -46,13 +48,11 @@ SAME_ACTION = 0.02
 class Images:
     """The range images themselves, in place of tokens."""
 
-    def __init__(self, perception: LidarPerception) -> None:
+    def __init__(self, perception: Perception) -> None:
         self.perception = perception
 
-    def __call__(self, tile: Tensor, position: Tensor, yaw: Tensor, counters: Tensor) -> Tensor:
-        p = self.perception
-        ranges = p.lidar.scan(tile, position + position.new_tensor([0.0, 0.0, p.lidar.spec.height]), yaw)
-        return p.corruption(ranges, counters[:, 0], counters[:, 1])
+    def __call__(self, robot: Dynamics, counters: Tensor) -> dict[str, Tensor]:
+        return {"lidar": self.perception.lidar.ranges(robot, counters)}
 
 
 class StockActor(RNNModel):
@@ -200,11 +200,11 @@ class Stopwatch:
 def shares(learner: Learner, iterations: int) -> dict[str, float]:
     """Share of the time of each part."""
     env: NavigationEnv = learner.env
-    ppo, perception, watch = learner.algorithm, env.perception, Stopwatch()
+    ppo, eye, watch = learner.algorithm, env.perceive.lidar, Stopwatch()
     actor: NavigationActor = ppo.actor
-    watch.wrap(perception.lidar, "scan", "LiDAR")
-    watch.wrap(perception, "corruption", "corruption")
-    watch.wrap(perception.encoder, "tokens", "encoder")
+    watch.wrap(eye.sensor, "scan", "LiDAR")
+    watch.wrap(eye, "corruption", "corruption")
+    watch.wrap(eye.encoder, "tokens", "encoder")
     watch.wrap(env.dynamics, "step", "dynamics")
     watch.wrap(env, "_lookup", "geodesic lookup")
     watch.wrap(env, "_reset", "resets")

@@ -1,31 +1,27 @@
-"""Paired evaluation: every arm walks the same episodes, one row each (paper, Sec. IV-A)."""
+"""Driving robots through episodes: what a driver sees, and how episodes end."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.scripted import straight_direction, walk
-from romnav.evaluation.spec import EvaluationSpec
 from romnav.navigation.env import to_command
-from romnav.navigation.observations import goal_observation
-from romnav.navigation.perception import LidarPerception
+from romnav.navigation.observations import observe
+from romnav.navigation.perception import Perception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.spec import EnvSpec
-from romnav.robot.dynamics import Body, Dynamics
+from romnav.progress import Progress
+from romnav.robot.dynamics import Dynamics
 from romnav.robot.rom import ReducedOrderModel
-from romnav.threads import torch_threads
 from romnav.world.geodesic import GeodesicLookup
 from romnav.world.world import World
-
-Progress = Callable[[int, int, str], None]
 
 
 class Driver(Protocol):
@@ -75,7 +71,7 @@ class View:
 class Policy:
     """A trained policy, acting by the mean of its distributions."""
 
-    def __init__(self, actor: NavigationActor, perception: LidarPerception) -> None:
+    def __init__(self, actor: NavigationActor, perception: Perception) -> None:
         self.actor = actor
         self.perception = perception
         perception.images = actor.encoder is not None
@@ -83,16 +79,10 @@ class Policy:
 
     def command(self, view: View) -> Tensor:
         """(A, 3) velocity command."""
-        r = view.robot
-        goal = goal_observation(r.position, r.yaw, view.goal_position, view.goal_yaw, view.env.max_goal_distance)
+        goal = view.goal_position, view.goal_yaw
         counters = torch.stack([view.noise, torch.full_like(view.noise, view.step)], dim=1)
-        obs = TensorDict(
-            {
-                "lidar": self.perception(r.tile, r.position, r.yaw, counters),
-                "state": torch.cat([goal, view.previous], dim=1),
-            },
-            batch_size=[len(view.episode)],
-        )
+        d_max = view.env.max_goal_distance
+        obs = observe(view.robot, *goal, view.previous, counters, self.perception, d_max)
         return to_command(self.actor(obs), view.env.command)
 
     def select(self, keep: Tensor) -> None:
@@ -127,56 +117,6 @@ class Straight:
 
 
 SCRIPTED: dict[str, type[Oracle] | type[Straight]] = {"oracle": Oracle, "straight": Straight}
-
-
-@torch.inference_mode()
-def evaluate(
-    driver: Driver,
-    world: World,
-    episodes: EpisodeSet,
-    env: EnvSpec,
-    spec: EvaluationSpec,
-    progress: Progress | None = None,
-    body: Body = ReducedOrderModel,
-) -> dict[str, NDArray]:
-    """Drive all ``episodes`` once on robots that ``body`` makes.
-
-    An episode ends at success, at a fall or after ``spec.duration``.
-
-    Returns:
-        One array (n,) per column of the episode rows that a rollout measures: those of `Outcomes` and collisions.
-    """
-    with torch_threads(spec.threads):
-        return _evaluate(driver, world, episodes, env, spec, progress, body)
-
-
-def _evaluate(
-    driver: Driver,
-    world: World,
-    episodes: EpisodeSet,
-    env: EnvSpec,
-    spec: EvaluationSpec,
-    progress: Progress | None,
-    body: Body,
-) -> dict[str, NDArray]:
-    view = View(world, episodes, env, body(world, len(episodes), env.period))
-    outcomes = Outcomes(view, spec.duration, spec.reach)
-    collisions = torch.zeros(len(episodes), dtype=torch.int64, device=view.goal.device)
-    for step in outcomes.steps(progress):
-        robot = view.robot
-        command = driver.command(view)
-        before = robot.position[:, :2]
-        robot.step(command)
-        view.previous = command
-        view.step = step
-        collisions[view.episode] += ((robot.contacts > 0) & outcomes.alive()).long()
-        outcomes.add(before)
-        # dropping rows costs copies: do it once a quarter of the batch is idle
-        if 0 < outcomes.left < 0.75 * len(view.episode):
-            keep = outcomes.alive().nonzero()[:, 0]
-            view.select(keep)
-            driver.select(keep)
-    return {**outcomes.columns(), "collisions": collisions.cpu().numpy()}
 
 
 class Outcomes:

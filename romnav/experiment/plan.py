@@ -174,7 +174,10 @@ class Plan:
         """The trained policy of an arm, or of the one whose policy it drives."""
         arm = self.project.driver(arm)
         settings = self.settings(arm)
-        pretrained = settings.navigation.encoder.pretrained
+        pretrained, walks = settings.navigation.encoder.pretrained, settings.navigation.dynamics == "g1"
+        encoders = [self.encoder(settings)] if pretrained else []
+        if walks:
+            encoders.append(self.encoder(settings, "depth"))
         folder = self.folder / arm / f"seed-{seed}"
         return Stage(
             kind="policy",
@@ -183,8 +186,12 @@ class Plan:
             outputs=("policy.pt", "curve.csv"),
             record=folder / "spec.json",
             settings=settings,
-            uses=("world", "lidar", "navigation", *(() if pretrained else ("pretrain.encoder",))),
-            upstream=(*((self.encoder(settings),) if pretrained else ()), *self._walking(settings)),
+            uses=(
+                *("world", "lidar", "navigation"),
+                *(() if pretrained else ("pretrain.encoder",)),
+                *(("depth", "pretrain_depth.corruption") if walks else ()),
+            ),
+            upstream=(*encoders, *self._walking(settings)),
             scratch=("checkpoint.pt", "curve.csv"),
             arm=arm,
             seed=seed,

@@ -19,9 +19,9 @@ from romnav.experiment.spec import SCRIPTED, Experiment
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
-    from romnav.evaluation.paired.rows import Provenance
     from romnav.evaluation.rollout import Driver
-    from romnav.navigation.perception import LidarPerception
+    from romnav.evaluation.rowfile import Provenance
+    from romnav.navigation.perception import Eye, Perception
     from romnav.robot.dynamics import Body
     from romnav.sensing.depth import DepthCamera
     from romnav.sensing.lidar import Lidar
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from romnav.world.tile import Tile
     from romnav.world.world import World
 
+DEPTH_NOISE = 1_000_003
+"""Added to the seed of the LiDAR's noise for that of the camera."""
 EVALUATION_NOISE = 1
 """Seed of the sensor noise in evaluation: every arm meets the same noise in the same step of an episode."""
 
@@ -93,7 +95,7 @@ class Stages:
 
         settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
-        sensor = self._sensor(stage, settings, world.tiles)
+        sensor = self._sensor(str(stage.sensor), settings, world.tiles)
         path = pretrain(
             getattr(settings, PRETRAINING[str(stage.sensor)]),
             list(zip(world.tiles, world.grids, strict=True)),
@@ -122,7 +124,7 @@ class Stages:
         for index in range(spec.tiles):
             tiles.append(generate(terrain, index))
             progress(index + 1, spec.tiles, "tiles")
-        sensor = self._sensor(stage, settings, [tile for tile, _ in tiles])
+        sensor = self._sensor(str(stage.sensor), settings, [tile for tile, _ in tiles])
         model = load_autoencoder(stage.upstream[0].folder / "encoder.pt", self.device)
         corruption = getattr(settings, PRETRAINING[str(stage.sensor)]).corruption
         judged = (model, tiles, sensor, sensor.spec.height, corruption)
@@ -189,8 +191,8 @@ class Stages:
 
     def episodes(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Evaluates an arm on the paired episodes."""
-        from romnav.evaluation import episodes, rollout
-        from romnav.evaluation.paired import rows
+        from romnav.evaluation import episodes
+        from romnav.evaluation.paired import rows, run
 
         settings = cast(Scale, stage.settings)
         paired = episodes.load(self.plan.episode_set)
@@ -198,7 +200,7 @@ class Stages:
         driver = self._driver(stage, world)
         spec = settings.evaluation
         body = self._body(stage, spec.threads)
-        measured = rollout.evaluate(driver, world, paired, settings.navigation.env, spec, progress, body)
+        measured = run.run(driver, world, paired, settings.navigation.env, spec, progress, body)
         provenance = self._provenance(stage, paired.digest)
         count = len(paired)
         columns: dict[str, Any] = {
@@ -323,12 +325,14 @@ class Stages:
             return rollout.SCRIPTED[driver]()
         trained = stage.upstream[-1]
         perception = self._perception(trained, cast(Scale, stage.settings), world, EVALUATION_NOISE)
-        actor = checkpoint.load_actor(trained.folder / "policy.pt", perception.encoder, self.device)
+        depth = perception.depth.encoder if perception.depth else None
+        path = trained.folder / "policy.pt"
+        actor = checkpoint.load_actor(path, perception.encoder, self.device, depth_encoder=depth)
         return rollout.Policy(actor, perception)
 
     def _provenance(self, stage: Stage, episode_set: str) -> Provenance:
         """Where the rows of a stage come from."""
-        from romnav.evaluation.paired.rows import Provenance
+        from romnav.evaluation.rowfile import Provenance
 
         facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
         policy = None
@@ -354,29 +358,45 @@ class Stages:
 
         return build(spec, self._worlds, progress)
 
-    def _perception(self, policy: Stage, settings: Scale, world: World, noise: int) -> LidarPerception:
-        """What a policy sees: its pretrained encoder, or the random one that its training began with."""
-        from romnav.navigation.perception import LidarPerception
+    def _perception(self, policy: Stage, settings: Scale, world: World, noise: int) -> Perception:
+        """What a policy sees; through a depth camera, too, if its training had one."""
+        from romnav.navigation.perception import Perception
+
+        seen = {above.sensor: above.folder / "encoder.pt" for above in policy.upstream if above.kind == "encoder"}
+        lidar = self._eye("lidar", seen.get("lidar"), policy, settings, world, noise)
+        if "depth" not in seen:
+            return Perception(lidar)
+        return Perception(lidar, self._eye("depth", seen["depth"], policy, settings, world, noise + DEPTH_NOISE))
+
+    def _eye(
+        self, sensor: str, pretrained: Path | None, policy: Stage, settings: Scale, world: World, noise: int
+    ) -> Eye:
+        """A sensor with its pretrained encoder, or the random one that a policy's training began with."""
+        from romnav.navigation.perception import Eye
+        from romnav.robot.arms import OwnArms
         from romnav.sensing import encoder as encoders
         from romnav.sensing.corruption import Corruption
 
-        corruption = Corruption(settings.navigation.corruption, noise, self.device)
-        lidar, spec = self._lidar(settings, world.tiles), settings.pretrain.encoder
-        pretrained = [above for above in policy.upstream if above.kind == "encoder"]
-        if pretrained:
-            encoder = encoders.load(pretrained[0].folder / "encoder.pt", spec, self.device)
+        navigation, pretraining = settings.navigation, getattr(settings, PRETRAINING[sensor])
+        eye, spec = self._sensor(sensor, settings, world.tiles), pretraining.encoder
+        if pretrained is not None:
+            encoder = encoders.load(pretrained, spec, self.device)
         else:
-            encoder = encoders.untrained(spec, lidar.directions, policy.seed or 0).encoder.to(self.device)
-        return LidarPerception(lidar, corruption, encoder.requires_grad_(False))
+            encoder = encoders.untrained(spec, eye.directions, policy.seed or 0).encoder.to(self.device)
+        # a running sensor loses far fewer pixels than pretraining drops, a camera as a LiDAR
+        depth = pretraining.corruption.model_copy(update={"dropout": navigation.corruption.dropout})
+        corruption = Corruption(navigation.corruption if sensor == "lidar" else depth, noise, self.device)
+        arms = None
+        if navigation.dynamics == "g1":
+            robot = settings.locomotion.robot
+            arms = OwnArms(robot, eye.directions, levelled=sensor == "lidar", device=self.device)
+        return Eye(eye, corruption, encoder.requires_grad_(False), arms)
 
-    def _lidar(self, settings: Scale, tiles: Sequence[Tile]) -> Lidar:
+    def _sensor(self, sensor: str, settings: Scale, tiles: Sequence[Tile]) -> Lidar | DepthCamera:
+        from romnav.sensing.depth import DepthCamera
         from romnav.sensing.lidar import Lidar
 
-        return Lidar([tile.solids for tile in tiles], settings.lidar, self.device, self._worlds)
-
-    def _sensor(self, stage: Stage, settings: Scale, tiles: Sequence[Tile]) -> Lidar | DepthCamera:
-        if stage.sensor == "lidar":
-            return self._lidar(settings, tiles)
-        from romnav.sensing.depth import DepthCamera
-
-        return DepthCamera([tile.solids for tile in tiles], settings.depth, self.device)
+        solids = [tile.solids for tile in tiles]
+        if sensor == "lidar":
+            return Lidar(solids, settings.lidar, self.device, self._worlds)
+        return DepthCamera(solids, settings.depth, self.device)

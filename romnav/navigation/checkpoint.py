@@ -15,8 +15,7 @@ from tensordict import TensorDict
 
 from romnav import files
 from romnav.errors import RomnavError
-from romnav.navigation.env import STATE_SIZE
-from romnav.navigation.policy import NavigationActor
+from romnav.navigation.policy import BEARING, NavigationActor
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.encoder import Encoder
@@ -50,27 +49,36 @@ def read(path: Path, device: str = "cpu") -> dict[str, Any]:
     return content
 
 
-def load_actor(path: Path, encoder: Encoder, device: str = "cpu") -> NavigationActor:
-    """The policy of ``path`` for the tokens of ``encoder``, in evaluation mode.
+def load_actor(
+    path: Path, encoder: Encoder, device: str = "cpu", *, depth_encoder: Encoder | None = None
+) -> NavigationActor:
+    """The policy of ``path`` for the tokens of ``encoder`` and ``depth_encoder``, in evaluation mode.
 
-    One that trained its encoder has a copy of ``encoder`` with its own weights.
+    One that trained its encoder has a copy of ``encoder`` with its own weights. One without a depth camera needs no
+    ``depth_encoder``.
 
     Raises:
         RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec.
     """
     content = read(path, device)
     own = any(name.startswith("encoder.") for name in content["actor"])
-    if content["encoder"] != encoder.digest() and not own:
-        raise RomnavError(
-            f"{path}: key 'encoder' is {content['encoder']}, but the encoder at hand is {encoder.digest()}; "
-            "train the arm again or restore the encoder it was trained with"
-        )
+    has_depth = content.get("depth_encoder") is not None
+    used = {"encoder": None if own else encoder, "depth_encoder": depth_encoder if has_depth else None}
+    for key, given in used.items():
+        if given is not None and content[key] != given.digest():
+            raise RomnavError(
+                f"{path}: key '{key}' is {content[key]}, but the encoder at hand is {given.digest()}; "
+                "train the arm again or restore the encoder it was trained with"
+            )
+    if has_depth and depth_encoder is None:
+        raise RomnavError(f"{path}: the policy sees through a depth camera; drive it on the humanoid that has one")
     try:
         spec = NavigationSpec.model_validate_json(content["spec"])
-        obs = TensorDict(
-            {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, STATE_SIZE)}, batch_size=[1]
-        )
-        actor = make_actor(obs, spec.policy)
+        state = content["actor"]["state_embedding.0.weight"].shape[1] - BEARING
+        seen = {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, state)}
+        if has_depth and depth_encoder is not None:
+            seen["depth"] = torch.zeros(1, *depth_encoder.token_shape)
+        actor = make_actor(TensorDict(seen, batch_size=[1]), spec.policy)
         if own:
             actor.encoder = copy.deepcopy(encoder)
         actor.load_state_dict(content["actor"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,18 +11,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from romnav import random
-from romnav.navigation.observations import GOAL_SIZE, PrivilegedObservation, goal_observation, wrap
+from romnav.navigation.observations import ACTIONS, Perceive, PrivilegedObservation, observe, wrap
 from romnav.navigation.rewards import Transition, terms, weights
 from romnav.navigation.spec import CommandSpec, EnvSpec
 from romnav.robot.dynamics import Dynamics
 from romnav.world.geodesic import GeodesicLookup
 from romnav.world.spawns import Start, is_cross_level, sample
 from romnav.world.world import World
-
-ACTIONS = 3
-STATE_SIZE = GOAL_SIZE + ACTIONS
-Perception = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""(tile, position, yaw, counters (E, 2) naming environment and step) -> tokens (E, K, C)."""
 
 
 def to_command(actions: Tensor, spec: CommandSpec) -> Tensor:
@@ -49,18 +43,18 @@ class Statistics:
 
 
 class NavigationEnv(VecEnv):
-    """``E`` robots that walk to goals. Observations: "lidar" (E, K, C) tokens, "state" (E, 9), "critic".
+    """``E`` robots that walk to goals. Observations: those of `observe`, and "critic".
 
     Every random choice is a function of (seed, environment, episode or step), so that environments are independent
     of each other and a restored run continues as if it had never stopped.
     """
 
     def __init__(
-        self, world: World, dynamics: Dynamics, perception: Perception, spec: EnvSpec, seed: int, device: str
+        self, world: World, dynamics: Dynamics, perceive: Perceive, spec: EnvSpec, seed: int, device: str
     ) -> None:
         self.world = world
         self.dynamics = dynamics
-        self.perception = perception
+        self.perceive = perceive
         self.spec = spec
         self.cfg = spec.model_dump()
         self.seed = seed
@@ -134,13 +128,9 @@ class NavigationEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """Observations of the present state."""
         d = self.dynamics
-        state = torch.cat(
-            [
-                goal_observation(d.position, d.yaw, self._goal_position, self._goal_yaw, self.spec.max_goal_distance),
-                self._command,
-            ],
-            dim=1,
-        )
+        counters = torch.stack([self._env, torch.full_like(self._env, self._step)], dim=1)
+        d_max = self.spec.max_goal_distance
+        seen = observe(d, self._goal_position, self._goal_yaw, self._command, counters, self.perceive, d_max)
         remaining = 1.0 - self.episode_length_buf / self.max_episode_length
         privileged = self._privileged(
             d.tile,
@@ -153,12 +143,8 @@ class NavigationEnv(VecEnv):
             (self._since_arrival >= 0).to(torch.float32),
             self._cross.to(torch.float32),
         )
-        counters = torch.stack([self._env, torch.full_like(self._env, self._step)], dim=1)
-        tokens = self.perception(d.tile, d.position, d.yaw, counters)
-        return TensorDict(
-            {"lidar": tokens, "state": state, "critic": torch.cat([state, privileged], dim=1)},
-            batch_size=[self.num_envs],
-        )
+        seen["critic"] = torch.cat([seen["state"], privileged], dim=1)
+        return seen
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
         """Drive all robots for one period; finished ones start anew before they are observed."""

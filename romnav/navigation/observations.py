@@ -1,12 +1,15 @@
-"""Observations of the navigation policy and its privileged critic (paper, Sec. III-B)."""
+"""Observations of the navigation policy and its privileged critic (paper, Sec. III-B): one function, whoever asks."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
+from romnav.robot.dynamics import Dynamics
 from romnav.world.world import World
 
 PATCH = 9
@@ -14,7 +17,12 @@ PATCH = 9
 PATCH_STEP = 0.4
 """Spacing of the patch, m."""
 GOAL_SIZE = 6
+ACTIONS = 3
+STATE_SIZE = GOAL_SIZE + ACTIONS
+"""Non-visual observation on the reduced-order model; on the humanoid, proprioception follows."""
 PRIVILEGED_SIZE = PATCH * PATCH + 7
+Perceive = Callable[[Dynamics, Tensor], dict[str, Tensor]]
+"""(robots, counters (E, 2) naming environment and step) -> tokens or images (E, ...) by sensor."""
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -49,6 +57,35 @@ def goal_observation(position: Tensor, yaw: Tensor, goal: Tensor, goal_yaw: Tens
         ],
         dim=1,
     )
+
+
+def observe(
+    robot: Dynamics,
+    goal: Tensor,
+    goal_yaw: Tensor,
+    previous: Tensor,
+    counters: Tensor,
+    perceive: Perceive,
+    d_max: float,
+) -> TensorDict:
+    """What a policy may know, in training, evaluation and trials alike.
+
+    Args:
+        robot: ``E`` of them.
+        goal: (E, 3) positions, tile frame, m.
+        goal_yaw: (E,) headings to arrive with, rad.
+        previous: (E, 3) commands of the step before, m/s and rad/s.
+        counters: (E, 2) environment and step, which name the sensors' noise.
+        perceive: The sensors.
+        d_max: Of the goal observation, m.
+
+    Returns:
+        "state" (E, `STATE_SIZE` + P): goal, previous command, proprioception; and what the sensors see, by their names.
+        So the reduced-order model's observation is the beginning of the humanoid's.
+    """
+    own = goal_observation(robot.position, robot.yaw, goal, goal_yaw, d_max)
+    state = torch.cat([own, previous, robot.proprioception], dim=1)
+    return TensorDict({**perceive(robot, counters), "state": state}, batch_size=[len(state)])
 
 
 class PrivilegedObservation:

@@ -1,38 +1,79 @@
-"""From poses to LiDAR tokens: scan, corruption and frozen encoder, computed once per step."""
+"""From robots to tokens: what the sensors in their heads see, corrupted and encoded once per step."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from romnav.robot.arms import OwnArms
+from romnav.robot.dynamics import Dynamics
 from romnav.sensing.corruption import Corruption
+from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import Encoder
 from romnav.sensing.lidar import Lidar
 
 
-class LidarPerception:
-    """What the LiDAR sees from robots standing at given poses: tokens of a frozen encoder, or images.
+class Eye:
+    """One sensor, what is done to its images, and the frozen encoder of them.
 
-    While the encoder is frozen, rollouts keep tokens in bfloat16, never images: they are all that learning needs.
+    Args:
+        sensor: LiDAR or depth camera.
+        corruption: Of its images.
+        encoder: Of its images.
+        arms: What the robot's own arms hide, where it has any.
     """
 
-    def __init__(self, lidar: Lidar, corruption: Corruption, encoder: Encoder) -> None:
-        self.lidar = lidar
+    def __init__(
+        self, sensor: Lidar | DepthCamera, corruption: Corruption, encoder: Encoder, arms: OwnArms | None = None
+    ) -> None:
+        self.sensor = sensor
         self.corruption = corruption
         self.encoder = encoder
-        self.images = False
-        """Whether to yield images, for a policy that has an encoder of its own."""
-        self._mount = torch.tensor([0.0, 0.0, lidar.spec.height], device=encoder.directions.device)
+        self.arms = arms
+        self._mount = torch.tensor([0.0, 0.0, sensor.spec.height], device=encoder.directions.device)
 
-    def __call__(self, tile: Tensor, position: Tensor, yaw: Tensor, counters: Tensor) -> Tensor:
-        """(E, K, C) bfloat16 tokens, or (E, rows, columns) float16 images in m, 8 mm exact at 16 m.
+    def ranges(self, robot: Dynamics, counters: Tensor) -> Tensor:
+        """(E, rows, columns) images in m, 0 where there is no return.
 
         Args:
-            tile: (E,) int.
-            position: (E, 3) on the walking surface, tile frame, m.
-            yaw: (E,) rad.
+            robot: Carries the sensor in its head; one without a head has it above the ground it stands on (paper,
+                Sec. III-C).
             counters: (E, 2) environment and step, which name the random numbers of the corruption.
         """
-        ranges = self.lidar.scan(tile.to(torch.int32), position + self._mount, yaw)
-        ranges = self.corruption(ranges, counters[:, 0], counters[:, 1])
-        return ranges.half() if self.images else self.encoder.tokens(ranges).to(torch.bfloat16)
+        head = robot.head
+        if head is None:
+            origin, yaw, tilt = robot.position + self._mount, robot.yaw, None
+        else:
+            origin, yaw, tilt = head
+        ranges = self.sensor.scan(robot.tile.to(torch.int32), origin, yaw, tilt=tilt)
+        if self.arms is not None and tilt is not None:
+            ranges = torch.where(self.arms(tilt), 0.0, ranges)
+        return self.corruption(ranges, counters[:, 0], counters[:, 1])
+
+
+class Perception:
+    """What a policy sees of the world: "lidar", and "depth" if it has a camera.
+
+    While the LiDAR's encoder is frozen, rollouts keep its tokens in bfloat16, never images: they are all that learning
+    needs.
+    """
+
+    def __init__(self, lidar: Eye, depth: Eye | None = None) -> None:
+        self.lidar = lidar
+        self.depth = depth
+        self.images = False
+        """Whether "lidar" is images, for a policy that has an encoder of its own."""
+
+    @property
+    def encoder(self) -> Encoder:
+        """The LiDAR's."""
+        return self.lidar.encoder
+
+    def __call__(self, robot: Dynamics, counters: Tensor) -> dict[str, Tensor]:
+        """(E, K, C) bfloat16 tokens of each sensor; of the LiDAR (E, rows, columns) float16 images in m, 8 mm exact at
+        16 m, if it is to be `images`. ``counters`` (E, 2) are environment and step."""
+        ranges = self.lidar.ranges(robot, counters)
+        seen = {"lidar": ranges.half() if self.images else self.encoder.tokens(ranges).to(torch.bfloat16)}
+        if self.depth is not None:
+            seen["depth"] = self.depth.encoder.tokens(self.depth.ranges(robot, counters)).to(torch.bfloat16)
+        return seen

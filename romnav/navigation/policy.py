@@ -1,4 +1,4 @@
-"""The policy network (paper, Sec. III-B): LiDAR tokens, attention, GRU memory, Beta distributions."""
+"""The policy network (paper, Sec. III-B): LiDAR tokens, attention, depth, GRU memory, Beta distributions."""
 
 from __future__ import annotations
 
@@ -17,18 +17,22 @@ from romnav.precision import product_dtype, reduced_precision
 from romnav.sensing.encoder import Encoder
 
 LAYERS = 2
+BEARING = 2
+"""Numbers that `with_bearing` adds."""
 STATE_SCALE = (0.1, 0.1, 1.0, 0.25, 1.0, 1.0, 1.0, 4.0, 1.0)
-"""Brings goal (m) and command (m/s, rad/s) to the order of one."""
+"""Brings goal (m) and command (m/s, rad/s) to the order of one; proprioception is of that order."""
 
 
 def with_bearing(state: Tensor) -> Tensor:
-    """Non-visual observation (B, 9) scaled to the order of one, with the goal's bearing as a unit vector: (B, 11).
+    """Non-visual observation (B, 9 + P) scaled to the order of one, with the goal's bearing as a unit vector before the
+    proprioception: (B, 11 + P).
 
     The bearing is in ``dx, dy`` already, but near the goal these are small, and dividing them is what a narrow dense
     layer learns slowest.
     """
     bearing = torch.nn.functional.normalize(state[:, :2], dim=1, eps=0.05)
-    return torch.cat([state * state.new_tensor(STATE_SCALE), bearing], dim=1)
+    task, felt = state[:, : len(STATE_SCALE)], state[:, len(STATE_SCALE) :]
+    return torch.cat([task * state.new_tensor(STATE_SCALE), bearing, felt], dim=1)
 
 
 class GRULayer(torch.autograd.Function):
@@ -148,7 +152,9 @@ class Attention(nn.Module):
 class NavigationActor(MLPModel):
     """rsl-rl actor: attention over LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
 
-    In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts.
+    In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts. Of the
+    observations it reads as much as those had that it was made for: one for the reduced-order model drives a humanoid,
+    too. What a humanoid has in addition, proprioception and depth, comes last in every layer that reads it.
     """
 
     is_recurrent = True
@@ -164,7 +170,9 @@ class NavigationActor(MLPModel):
         tokens, channels = obs["lidar"].shape[1:]
         embedding = 64
         visual = (spec.queries + 1) * spec.attention
-        self._latent = spec.recurrent + visual + embedding
+        self.depth = "depth" in obs.keys()  # noqa: SIM118 - a TensorDict iterates over its batch
+        seen = visual + embedding + (obs["depth"][0].numel() if self.depth else 0)
+        self._latent = spec.recurrent + seen
         super().__init__(
             obs,
             obs_groups,
@@ -173,9 +181,9 @@ class NavigationActor(MLPModel):
             hidden_dims=[spec.hidden],
             distribution_cfg={"class_name": "BetaDistribution"},
         )
-        self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + 2, embedding), nn.ELU())
+        self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + BEARING, embedding), nn.ELU())
         self.attention = Attention(tokens, channels, embedding, spec)
-        self.core = RecurrentCore(visual + embedding, spec.recurrent)
+        self.core = RecurrentCore(seen, spec.recurrent)
         self.encoder: Encoder | None = None
         """Encoder of its own; then "lidar" are images (B, rows, columns) in m, otherwise tokens of a frozen one."""
         self._hidden: Tensor | None = None
@@ -201,10 +209,13 @@ class NavigationActor(MLPModel):
         """``[h_t, visual, state]`` of one step (B, ...) or, with episode starts as ``masks``, a rollout (T, B, ...)."""
         single = masks is None
         lead = obs["state"].shape[:-1]
-        state = self.state_embedding(with_bearing(obs["state"].flatten(0, -2)))
+        state = self.state_embedding(with_bearing(obs["state"][..., : self.obs_dim].flatten(0, -2)))
         lidar = obs["lidar"].flatten(0, -3)
         tokens = lidar.to(product_dtype(lidar.device)) if self.encoder is None else self.encoder(lidar.float())
-        seen = torch.cat([self.attention(tokens, state), state], dim=1).unflatten(0, lead)
+        parts = [self.attention(tokens, state), state]
+        if self.depth:
+            parts.append(obs["depth"].flatten(0, -3).flatten(1).to(state.dtype))
+        seen = torch.cat(parts, dim=1).unflatten(0, lead)
         if single:
             hidden = self._hidden_for(lead[0], seen)
             starts = torch.zeros(1, lead[0], dtype=torch.bool, device=seen.device)

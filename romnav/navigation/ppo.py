@@ -15,7 +15,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from romnav.navigation.env import ACTIONS
+from romnav.navigation.observations import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
 from romnav.navigation.spec import PolicySpec, PPOSpec
 from romnav.precision import reduced_precision

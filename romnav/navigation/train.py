@@ -17,7 +17,7 @@ from romnav import files
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
-from romnav.navigation.perception import LidarPerception
+from romnav.navigation.perception import Perception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
 from romnav.navigation.spec import NavigationSpec
 from romnav.robot.dynamics import Body
@@ -34,7 +34,7 @@ Progress = Callable[[int, int, str], None]
 def train(
     spec: NavigationSpec,
     world: World,
-    perception: LidarPerception,
+    perception: Perception,
     out: Path,
     seed: int,
     *,
@@ -59,7 +59,7 @@ def train(
 def _train(
     spec: NavigationSpec,
     world: World,
-    perception: LidarPerception,
+    perception: Perception,
     out: Path,
     seed: int,
     body: Body,
@@ -75,6 +75,8 @@ def _train(
     obs = env.get_observations()
     ppo = make_ppo(obs, spec.policy, spec.ppo, spec.env.envs, device)
     identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
+    if perception.depth is not None:
+        identity["depth_encoder"] = perception.depth.encoder.digest()
     total = spec.ppo.iterations * spec.ppo.stages
     unfreeze_at = round(spec.encoder.unfreeze_at * total)
     state = out / "checkpoint.pt"
@@ -147,7 +149,7 @@ def _save(
     _write_curve(path.with_name("curve.csv"), curve)
 
 
-def _unfreeze(ppo: BoundedPPO, env: NavigationEnv, perception: LidarPerception) -> TensorDict:
+def _unfreeze(ppo: BoundedPPO, env: NavigationEnv, perception: Perception) -> TensorDict:
     """Let PPO train the encoder as well; returns the present observations, with images."""
     perception.images = True
     obs = env.get_observations()

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
 from romnav.world.spawns import Start
 from romnav.world.world import World
+
+
+class Head(NamedTuple):
+    """Where the sensors in the heads of ``E`` robots are, tile frame."""
+
+    origin: Tensor
+    """(E, 3) m."""
+    yaw: Tensor
+    """(E,) rad."""
+    tilt: Tensor
+    """(E, 2) roll and pitch, rad."""
 
 
 class Dynamics(Protocol):
@@ -29,6 +40,16 @@ class Dynamics(Protocol):
     """(E,) float32 bodies in contact with obstacles during the last step."""
     fallen: Tensor
     """(E,) bool."""
+
+    @property
+    def proprioception(self) -> Tensor:
+        """(E, P) what the robot feels of its own motion; P is 0 for a body that has none (paper, Sec. III-B)."""
+        ...
+
+    @property
+    def head(self) -> Head | None:
+        """Where its sensors are; None for a body whose head never sways."""
+        ...
 
     def reset(self, envs: Tensor, start: Start) -> None:
         """Put the robots ``envs`` (K,) at their starts."""

@@ -27,6 +27,8 @@ SOLE = (0.035, 0.0, -0.035)
 """Centre of the sole in the frame of the ankle-roll body, m."""
 FOOT_LENGTH, FOOT_WIDTH = 0.185, 0.07
 """Size of the sole, m."""
+HEAD = (0.0003, 0.0, 0.4284)
+"""Sensors in the frame of the torso, m (Unitree's URDF: `torso_link` to `mid360_link`)."""
 _SOLE_RADIUS = 0.01
 _BEGIN = 1.0
 """Time of a robot that is placed, s: one that MuJoCo had to reset is at 0."""
@@ -53,6 +55,10 @@ class Boxes(NamedTuple):
             model.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half, quat=quat, contype=1, conaffinity=1
             )
+
+
+NOTHING = Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
+"""Flat ground."""
 
 
 def _asset(name: str) -> str:
@@ -178,6 +184,7 @@ class Robots(ABC):
         joints, joint_velocity: (n, 15), rad, rad/s, in the order of `JOINTS`.
         com, com_velocity: (n, 3) of the whole robot, world.
         ankle, ankle_rotation: (n, 2, 3), (n, 2, 3, 3) of the ankle-roll bodies, left and right, world.
+        torso, torso_rotation: (n, 3), (n, 3, 3) of the body that carries the head, world.
         anchor, axis: (n, 15, 3) joint anchors and axes, world.
         touch: (n, bodies) whether each collision body is in contact; `feet` are the columns of the feet.
         torque: (n, 15) of the actuators, N m.
@@ -199,6 +206,7 @@ class Robots(ABC):
         self._com_velocity = int(self.model.sensor("com_velocity").adr[0])
         self.feet = [self.touch_names.index(f"{side}_ankle_roll_link") for side in SIDES]
         self._ankles = [self.model.body(f"{side}_ankle_roll_link").id for side in SIDES]
+        self._torso = self.model.body("torso_link").id
         self.touch = torch.zeros(count, len(touch), dtype=torch.bool)
         self.torque = torch.zeros(count, len(JOINTS))
         self.lost = torch.zeros(count, dtype=torch.bool)
@@ -215,6 +223,7 @@ class Robots(ABC):
         self.com = self._field("subtree_com")[:, 1]
         self.com_velocity = self._field("sensordata")[:, self._com_velocity : self._com_velocity + 3]
         self.ankle, self.ankle_rotation = xpos[:, self._ankles], xmat[:, self._ankles].reshape(-1, 2, 3, 3)
+        self.torso, self.torso_rotation = xpos[:, self._torso], xmat[:, self._torso].reshape(-1, 3, 3)
         self.anchor, self.axis = self._field("xanchor")[:, 1:], self._field("xaxis")[:, 1:]
 
     @abstractmethod

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from romnav import random
 from romnav.errors import RomnavError
-from romnav.robot.g1 import Humanoids, build_spec
+from romnav.robot.dynamics import Head
+from romnav.robot.g1 import HEAD, Humanoids, build_spec
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
@@ -160,6 +161,21 @@ class Humanoid:
                     best, up = away, run * np.sign(rise)
                     found = float(np.arctan2(up[1], up[0])), abs(rise) / length
         return found
+
+    @property
+    def proprioception(self) -> Tensor:
+        """(E, 8): gait phase (sine, cosine), pelvis angular rate, rad/s, and projected gravity, both pelvis frame."""
+        angle = torch.pi * self.control.walker.clock / self._spec.gait.step_ticks
+        phase = torch.stack([torch.sin(angle), torch.cos(angle)], dim=1)
+        return torch.cat([phase, self.robots.spin, -self.robots.orientation[:, 2]], dim=1).nan_to_num()
+
+    @property
+    def head(self) -> Head:
+        """Sensors as the torso carries them."""
+        turn = self.robots.torso_rotation.nan_to_num()
+        origin = (self.robots.torso + turn @ torch.tensor(HEAD)).nan_to_num()
+        tilt = torch.stack([torch.atan2(turn[:, 2, 1], turn[:, 2, 2]), -turn[:, 2, 0].clamp(-1.0, 1.0).asin()], dim=1)
+        return Head(origin, heading_of(turn), tilt)
 
     @torch.no_grad()
     def step(self, command: Tensor) -> None:

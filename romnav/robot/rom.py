@@ -33,6 +33,14 @@ class ReducedOrderModel:
         self.contacts = torch.zeros(envs, device=device)
         self.fallen = torch.zeros(envs, dtype=torch.bool, device=device)
 
+    head = None
+    """Sensors stand upright above the ground, as on a standing humanoid (P)."""
+
+    @property
+    def proprioception(self) -> Tensor:
+        """(E, 0): it feels nothing."""
+        return self.yaw.new_empty(len(self.yaw), 0)
+
     def reset(self, envs: Tensor, start: Start) -> None:
         """Put the robots ``envs`` (K,) at their starts."""
         self.tile[envs] = start.tile

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, overload
 
 import numpy as np
 import torch
@@ -152,6 +153,22 @@ class DepthCamera:
         packed = np.concatenate([columns.pack(s) for s in solids])
         self._solids = wp.array(packed, dtype=columns.Solid, device=device)
         self._first = wp.array(np.cumsum([0, *map(len, solids)]), dtype=wp.int32, device=device)
+
+    @overload
+    def scan(
+        self,
+        tile: Tensor,
+        origin: Tensor,
+        yaw: Tensor,
+        *,
+        labels: Literal[False] = ...,
+        tilt: Tensor | None = ...,
+    ) -> Tensor: ...
+
+    @overload
+    def scan(
+        self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: Literal[True], tilt: Tensor | None = ...
+    ) -> tuple[Tensor, Tensor]: ...
 
     def scan(
         self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: bool = False, tilt: Tensor | None = None

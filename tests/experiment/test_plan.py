@@ -203,6 +203,7 @@ def test_a_policy_drives_another_body_without_being_trained_again(tmp_path: Path
         "locomotion",
         "gait library",
         "encoder lidar",
+        "encoder depth",
         "policy own, seed 0",
     }
     assert "locomotion" in everything(here.policy("own", 0))

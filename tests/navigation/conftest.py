@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from romnav.navigation.spec import EnvSpec, NavigationSpec, PolicySpec, PPOSpec
+from romnav.robot.dynamics import Dynamics
 from romnav.sensing.encoder import Encoder, untrained
 from romnav.sensing.spec import EncoderSpec
 from romnav.world.build import build
@@ -28,13 +29,14 @@ class FakePerception:
 
     def __init__(self) -> None:
         self.encoder = fake_encoder()
+        self.depth = None
         self.images = False
 
-    def __call__(self, tile: Tensor, position: Tensor, yaw: Tensor, counters: Tensor) -> Tensor:
+    def __call__(self, robot: Dynamics, counters: Tensor) -> dict[str, Tensor]:
         phase = torch.arange(32) * 0.37
-        sums = position.sum(dim=1) + yaw + tile + counters[:, 0] + 0.1 * counters[:, 1]
+        sums = robot.position.sum(dim=1) + robot.yaw + robot.tile + counters[:, 0] + 0.1 * counters[:, 1]
         ranges = 2.5 + 2.0 * torch.sin(sums[:, None] + phase).view(-1, 4, 8)
-        return ranges.half() if self.images else self.encoder.tokens(ranges).to(torch.bfloat16)
+        return {"lidar": ranges.half() if self.images else self.encoder.tokens(ranges).to(torch.bfloat16)}
 
 
 @pytest.fixture(scope="session")

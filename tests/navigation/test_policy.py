@@ -150,3 +150,30 @@ def test_any_number_of_tokens(tokens: int) -> None:
     policy = actor(tokens)
     policy.reset()
     assert policy(obs).shape == (3, 3)
+
+
+def test_a_policy_made_for_fewer_observations_ignores_the_rest() -> None:
+    humanoid = rollout(4, 3)
+    humanoid["state"] = torch.cat([humanoid["state"], torch.randn(4, 3, 8)], dim=2)
+    humanoid["depth"] = torch.randn(4, 3, 4, 32)
+    one, other = actor(), actor()
+    for step in range(4):
+        assert torch.equal(one(humanoid[step]), other(rollout(4, 3)[step]))
+
+
+@pytest.mark.parametrize("part", ["depth", "felt"])
+def test_depth_and_proprioception_reach_the_actions(part: str) -> None:
+    obs = rollout(4, 3)
+    obs["state"] = torch.cat([obs["state"], torch.randn(4, 3, 8)], dim=2)
+    obs["depth"] = torch.randn(4, 3, 4, 32).to(torch.bfloat16)
+    changed = obs.clone()
+    if part == "depth":
+        changed["depth"][:, 1] += 1.0
+    else:
+        changed["state"][:, 1, 9:] += 1.0
+    torch.manual_seed(0)
+    policy = NavigationActor(obs[0], {"actor": ["state"]}, "actor", 3, SPEC)
+    starts, memory = torch.zeros(4, 3, dtype=torch.bool), torch.zeros(2, 3, 16)
+    a, b = (policy(o, masks=starts, hidden_state=memory) for o in (obs, changed))
+    assert torch.equal(a[:, [0, 2]], b[:, [0, 2]])
+    assert not torch.allclose(a[:, 1], b[:, 1], atol=1e-4)

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint, train
-from romnav.navigation.env import STATE_SIZE
+from romnav.navigation.observations import STATE_SIZE
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.rewards import TERMS
 from romnav.navigation.spec import EncoderUseSpec, EnvSpec, NavigationSpec, PolicySpec, PPOSpec, RewardSpec
@@ -22,6 +22,7 @@ from romnav.precision import reduced_precision
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train as train_locomotion
+from romnav.robot.rom import ReducedOrderModel
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
@@ -164,8 +165,9 @@ def test_a_policy_with_its_own_encoder_carries_and_uses_it(world: World, spec: N
     assert_same(dict(actor.state_dict()), weights(tmp_path))
     perception.images = True
     torch.manual_seed(0)
-    pose = (torch.arange(5), torch.rand(5, 3), torch.rand(5), torch.zeros(5, 2))
-    images, state = perception(*pose), torch.rand(5, STATE_SIZE)
+    robots = ReducedOrderModel(world, 5, spec.env.period)
+    robots.position, robots.yaw = torch.rand(5, 3), torch.rand(5)
+    images, state = perception(robots, torch.zeros(5, 2))["lidar"], torch.rand(5, STATE_SIZE)
     mine = actor(TensorDict({"lidar": images, "state": state}, batch_size=[5]))
     template = TensorDict({"lidar": torch.zeros(1, *TOKENS), "state": state[:1]}, batch_size=[1])
     frozen = make_actor(template, spec.policy)

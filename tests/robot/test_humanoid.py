@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from romnav.errors import RomnavError
+from romnav.robot.g1 import HEAD
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train
@@ -94,6 +96,30 @@ def test_dropping_robots_changes_nothing_for_the_others(world: World, checkpoint
     # Vectorised arithmetic rounds otherwise in a batch of another size.
     torch.testing.assert_close(part.position, whole.position[keep], atol=1e-4, rtol=0)
     torch.testing.assert_close(part.yaw, whole.yaw[keep], atol=1e-4, rtol=0)
+
+
+def test_it_feels_its_gait_its_turning_and_gravity_and_its_head_sways(world: World, checkpoint: Path) -> None:
+    body = robot(world, 3, checkpoint)
+    body.reset(torch.arange(3), starts(world, level_nodes(world, 3), torch.tensor([0.0, 1.0, -2.0])))
+    state = body.control.snapshot(torch.arange(3))
+    angles = np.array([[0.3, 0.1, -0.05], [1.2, -0.07, 0.11], [-2.0, 0.0, 0.2]])
+    turn = Rotation.from_euler("ZYX", angles)
+    state["qpos"][:, 3:7] = torch.from_numpy(turn.as_quat()[:, [3, 0, 1, 2]])
+    state["qpos"][:, 19:22] = 0.0  # waist
+    state["qvel"][:, 3:6] = torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64)
+    state["clock"] = torch.tensor([0, 5, 30])
+    body.control.restore(torch.arange(3), state)
+    felt = body.proprioception
+    phase = 2 * np.pi * np.array([0, 5, 30]) / 40
+    np.testing.assert_allclose(felt[:, :2], np.column_stack([np.sin(phase), np.cos(phase)]), atol=1e-6)
+    np.testing.assert_allclose(felt[:, 2:5], [[0.1, 0.2, 0.3]] * 3, atol=1e-6)
+    np.testing.assert_allclose(felt[:, 5:], turn.inv().apply([0.0, 0.0, -1.0]), atol=1e-5)
+    head = body.head
+    np.testing.assert_allclose(head.yaw, angles[:, 0], atol=1e-5)
+    np.testing.assert_allclose(head.tilt, angles[:, [2, 1]], atol=1e-5)
+    torso = np.array([-0.0039635, 0.0, 0.044])  # of the model, with a straight waist
+    expected = body.robots.pelvis.numpy() + turn.apply(torso + np.array(HEAD))
+    np.testing.assert_allclose(head.origin, expected, atol=1e-4)
 
 
 def test_a_start_on_a_stair_faces_along_it_on_the_middle_of_a_tread(world: World, checkpoint: Path) -> None:

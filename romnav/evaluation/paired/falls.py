@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
-from romnav.evaluation.rollout import Driver, evaluate
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Driver
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
@@ -124,7 +125,7 @@ def count(
         made.append(Tally(body, world, robots, period))
         return made[0]
 
-    columns = evaluate(driver, world, episodes, env, spec, progress, tallied)
+    columns = run(driver, world, episodes, env, spec, progress, tallied)
     (tally,) = made
     n = len(episodes)
 

@@ -1,7 +1,4 @@
-"""Episode rows: one parquet file per arm and training seed, one row per evaluation episode.
-
-Rows are all that evaluation hands on: metrics, tables and figures are pure functions of them.
-"""
+"""Episode rows: one parquet file per arm and training seed, one row per evaluation episode."""
 
 from __future__ import annotations
 
@@ -11,23 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ValidationError
 
-from romnav import files
-from romnav.config import Config
 from romnav.errors import RomnavError
+from romnav.evaluation.rowfile import POSES, Provenance, RowFile
 
-SCHEMA_VERSION = 1
 HORIZONS = (45, 120)
 """Evaluation horizons, s (paper, Sec. IV-A): the training budget, and the end of an episode."""
 SUCCESS_RADIUS = 0.5
 """Distance to the goal that counts as success, m (paper, Sec. IV-A)."""
-OUTCOMES = ("success", "fall", "timeout")
 TILE_CLASSES = ("outdoor", "room", "building")
 
-_POSES = [f"{end}_{axis}" for end in ("spawn", "goal") for axis in ("x", "y", "z", "yaw")]
 SCHEMA = pa.schema(
     [
         pa.field("arm", pa.string()),
@@ -36,7 +27,7 @@ SCHEMA = pa.schema(
         pa.field("tile", pa.int64()),
         pa.field("tile_class", pa.string()),
         pa.field("multi_story", pa.bool_()),
-        *(pa.field(name, pa.float64()) for name in _POSES),  # m, m, m, rad
+        *(pa.field(name, pa.float64()) for name in POSES),  # m, m, m, rad
         pa.field("geodesic", pa.float64()),  # planar length of the shortest path from spawn to goal, m
         pa.field("level", pa.string()),  # "same" or "cross": does the goal lie on another level
         pa.field("success_time", pa.float64()),  # first time within SUCCESS_RADIUS in 3D, s; NaN if never
@@ -47,29 +38,7 @@ SCHEMA = pa.schema(
         pa.field("collisions", pa.int64()),  # steps with contact
     ]
 )
-
-
-class Provenance(Config):
-    """Where a file of rows comes from."""
-
-    scale: str
-    """Scale of the run: smoke, cpu or paper."""
-    commit: str
-    """Git commit of the code that evaluated."""
-    spec_hash: str
-    """Hash of the arm's resolved specification."""
-    checkpoint_sha256: str | None
-    """Hash of the evaluated checkpoint; none for a scripted arm."""
-    episode_set: str
-    """Hash of the set of initial conditions."""
-    version: str
-    """Version of romnav."""
-    steps: int
-    """Environment steps of training; 0 for a scripted arm."""
-    hours: float
-    """Wall-clock time of training, h."""
-    machine: str
-    """Processor or GPU, and the operating system."""
+FILE = RowFile("rows", version=1, schema=SCHEMA, again="evaluate the arm again", compression="snappy")
 
 
 @dataclass(frozen=True)
@@ -145,23 +114,19 @@ def _check(c: Mapping[str, NDArray], source: str) -> None:
     if not np.array_equal(episodes, np.arange(n)):
         missing = np.setdiff1d(np.arange(episodes[-1] + 1), episodes)
         raise RomnavError(f"{source}: episode(s) {_some(missing)} missing; evaluate the arm again")
-    time, success = c["success_time"], np.isfinite(c["success_time"])
+    time = c["success_time"]
     holds: dict[str, NDArray] = {
         "arm": c["arm"] == c["arm"][0],
         "seed": c["seed"] == c["seed"][0],
         "tile_class": np.isin(c["tile_class"], TILE_CLASSES),
         "level": np.isin(c["level"], ("same", "cross")),
         "success_time": np.isnan(time) | ((time >= 0) & (time <= HORIZONS[-1])),
-        "outcome": np.isin(c["outcome"], OUTCOMES) & ((c["outcome"] == "success") == success),
         "final_distance": c["final_distance"] >= 0,
         "collisions": c["collisions"] >= 0,
         **{name: np.isfinite(c[name]) & (c[name] >= 0) for name in ("geodesic", "time", "path_length")},
-        **{name: np.isfinite(c[name]) for name in _POSES},
+        **{name: np.isfinite(c[name]) for name in POSES},
     }
-    for name, ok in holds.items():
-        if not np.all(ok):
-            worst = int(np.argmin(ok))
-            raise RomnavError(f"{source}: episode {worst} has an impossible {name} ({c[name][worst]}); evaluate again")
+    FILE.require(c, holds, source, "episode")
 
 
 def _some(ids: NDArray) -> str:
@@ -175,10 +140,7 @@ def write(path: Path, rows: EpisodeRows) -> None:
     Raises:
         RomnavError: The folder cannot be written or the disk is full.
     """
-    metadata = {"romnav.rows": str(SCHEMA_VERSION), "romnav.provenance": rows.provenance.model_dump_json()}
-    table = pa.table(dict(rows.columns), schema=SCHEMA.with_metadata(metadata))
-    with files.atomic(path) as file:
-        pq.write_table(table, file)
+    FILE.write(path, rows.columns, rows.provenance)
 
 
 def read(path: Path) -> EpisodeRows:
@@ -187,22 +149,7 @@ def read(path: Path) -> EpisodeRows:
     Raises:
         RomnavError: The file is missing, truncated, of another schema, or its rows are impossible.
     """
-    again = "evaluate the arm again"
-    try:
-        table = pq.ParquetFile(path).read()
-    except FileNotFoundError as error:
-        raise RomnavError(f"{path}: no such file of episode rows; evaluate the arm first") from error
-    except (OSError, pa.ArrowException) as error:
-        raise RomnavError(f"{path}: not a readable parquet file (truncated?); {again}") from error
-    metadata = table.schema.metadata or {}
-    version = metadata.get(b"romnav.rows", b"none").decode()
-    if version != str(SCHEMA_VERSION):
-        raise RomnavError(f"{path}: rows of schema version {version}, not {SCHEMA_VERSION}; {again}")
-    try:
-        provenance = Provenance.model_validate_json(metadata.get(b"romnav.provenance", b"{}"))
-    except ValidationError as error:
-        key = ".".join(str(part) for part in error.errors()[0]["loc"])
-        raise RomnavError(f"{path}: provenance key {key}: {error.errors()[0]['msg']}; {again}") from error
+    table, provenance, _ = FILE.read(path)
     return make(table.to_pydict(), provenance, str(path))  # to_numpy would import pandas
 
 

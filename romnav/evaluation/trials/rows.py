@@ -8,22 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from romnav import files
 from romnav.errors import RomnavError
-from romnav.evaluation.paired.rows import OUTCOMES, Provenance
+from romnav.evaluation.rowfile import POSES, Provenance, RowFile
 
-SCHEMA_VERSION = 1
-_POSES = [f"{end}_{axis}" for end in ("spawn", "goal") for axis in ("x", "y", "z", "yaw")]
 SCHEMA = pa.schema(
     [
         pa.field("scene", pa.string()),
         pa.field("filter", pa.bool_()),  # whether the safety filter was on
         pa.field("trial", pa.int64()),  # 0 .. n - 1 in each scene; the same start and goal with the filter off and on
-        *(pa.field(name, pa.float64()) for name in _POSES),  # m, m, m, rad
+        *(pa.field(name, pa.float64()) for name in POSES),  # m, m, m, rad
         pa.field("geodesic", pa.float64()),  # planar length of the shortest path, m
         pa.field("success_time", pa.float64()),  # s; NaN if never
         pa.field("outcome", pa.string()),
@@ -40,6 +35,7 @@ SCHEMA = pa.schema(
         pa.field("track", pa.list_(pa.int16())),  # x, y, z after every period from the start on, cm
     ]
 )
+FILE = RowFile("trials", version=1, schema=SCHEMA, again="run the experiment again", compression="zstd")
 
 
 @dataclass(frozen=True)
@@ -73,15 +69,7 @@ def write(path: Path, rows: TrialRows) -> None:
     Raises:
         RomnavError: The folder cannot be written or the disk is full.
     """
-    metadata = {
-        "romnav.trials": str(SCHEMA_VERSION),
-        "romnav.arm": rows.arm,
-        "romnav.seed": str(rows.seed),
-        "romnav.provenance": rows.provenance.model_dump_json(),
-    }
-    columns = {field.name: pa.array(rows.columns[field.name], type=field.type) for field in SCHEMA}
-    with files.atomic(path) as file:
-        pq.write_table(pa.table(columns, schema=SCHEMA.with_metadata(metadata)), file, compression="zstd")
+    FILE.write(path, rows.columns, rows.provenance, arm=rows.arm, seed=str(rows.seed))
 
 
 def read(path: Path) -> TrialRows:
@@ -90,25 +78,12 @@ def read(path: Path) -> TrialRows:
     Raises:
         RomnavError: The file is missing, truncated, of another schema, or its rows are impossible.
     """
-    again = "run the experiment again"
-    try:
-        table = pq.ParquetFile(path).read()
-    except FileNotFoundError as error:
-        raise RomnavError(f"{path}: no such file of trials; run the experiment first") from error
-    except (OSError, pa.ArrowException) as error:
-        raise RomnavError(f"{path}: not a readable parquet file (truncated?); {again}") from error
-    metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-    version = metadata.get("romnav.trials", "none")
-    if version != str(SCHEMA_VERSION) or table.schema.names != SCHEMA.names:
-        raise RomnavError(f"{path}: trials of schema version {version}, not {SCHEMA_VERSION}; {again}")
-    try:
-        provenance = Provenance.model_validate_json(metadata["romnav.provenance"])
-        arm, seed = metadata["romnav.arm"], int(metadata["romnav.seed"])
-    except (KeyError, ValueError, ValidationError) as error:
-        raise RomnavError(f"{path}: provenance is missing or damaged; {again}") from error
+    table, provenance, facts = FILE.read(path, "arm", "seed")
+    if table.schema.names != SCHEMA.names or not facts["seed"].isdecimal():
+        raise RomnavError(f"{path}: not the columns and the seed of trials; {FILE.again}")
     columns = {name: _array(table.column(name).to_pylist(), SCHEMA.field(name).type) for name in SCHEMA.names}
     _check(columns, path)
-    return TrialRows(arm, seed, columns, provenance)
+    return TrialRows(facts["arm"], int(facts["seed"]), columns, provenance)
 
 
 def _array(values: list, kind: pa.DataType) -> NDArray:
@@ -122,17 +97,13 @@ def _array(values: list, kind: pa.DataType) -> NDArray:
 def _check(c: Mapping[str, NDArray], path: Path) -> None:
     time, success = c["success_time"], np.isfinite(c["success_time"])
     holds: dict[str, NDArray] = {
-        "outcome": np.isin(c["outcome"], OUTCOMES) & ((c["outcome"] == "success") == success),
         "success_time": ~success | (time > 0),
         "collisions": c["collisions"] == [len(hits) for hits in c["hits"]],
         "track": np.array([len(track) >= 6 and len(track) % 3 == 0 for track in c["track"]], bool),
         **{name: c[name] >= 0 for name in ("geodesic", "time", "path_length", "contact_time", "held_time")},
     }
-    for name, ok in holds.items():
-        if not np.all(ok):
-            worst = int(np.argmin(ok))
-            raise RomnavError(f"{path}: row {worst} has an impossible {name} ({c[name][worst]}); run it again")
+    FILE.require(c, holds, str(path), "row")
     for scene in dict.fromkeys(c["scene"]):
         off, on = (c["trial"][(c["scene"] == scene) & (c["filter"] == f)] for f in (False, True))
         if not np.array_equal(off, np.arange(len(off))) or not np.array_equal(on, off):
-            raise RomnavError(f"{path}: scene {scene}: trials with the filter off and on do not pair; run it again")
+            raise RomnavError(f"{path}: scene {scene}: trials with the filter off and on do not pair; {FILE.again}")

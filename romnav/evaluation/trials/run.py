@@ -16,10 +16,11 @@ from torch import Tensor
 
 from romnav import random
 from romnav.evaluation.episodes import EpisodeSet
-from romnav.evaluation.rollout import Driver, Outcomes, Progress, View
+from romnav.evaluation.rollout import Driver, Outcomes, View
 from romnav.evaluation.spec import TrialSpec
 from romnav.navigation.observations import rotate
 from romnav.navigation.spec import EnvSpec
+from romnav.progress import Progress
 from romnav.robot.body import BodyModel
 from romnav.safety.filter import Filtered, SafetyFilter, Status
 from romnav.sensing.corruption import Corruption

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from romnav.evaluation.paired.statistics import mcnemar_mid_p, resampled_sums, wilson
+from romnav.evaluation.intervals import mcnemar_mid_p, resampled_sums, wilson
 from romnav.evaluation.trials.rows import TrialRows
 
 Event = Literal["success", "collision"]

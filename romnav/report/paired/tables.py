@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ from romnav.evaluation.paired.rows import HORIZONS, Arm
 from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
+from romnav.report.provenance import distinct, sources, training
 
 
 @dataclass(frozen=True)
@@ -229,21 +229,12 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     runs = [run for arm in shown for run in arm.runs]
     if not runs:
         raise RomnavError(f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first")
-    trained = [arm for arm in shown if any(run.provenance.steps for run in arm.runs)]
-    facts = {
-        "scale": _list(run.provenance.scale for run in runs),
-        "commit": _list(re.sub(r"(?<=^\w{12})\w+", "", run.provenance.commit) for run in runs),
-        "episode_set": runs[0].provenance.episode_set,
-    }
-    steps = _list(f"{run.provenance.steps / 1e6:.3g} M" for arm in trained for run in arm.runs)
-    seeds = _list(str(len(arm.runs)) for arm in trained)
+    files = [run.provenance for run in runs]
+    facts = sources(files)
+    seeds = distinct(str(len(arm.runs)) for arm in shown if any(run.provenance.steps for run in arm.runs))
     note = (
-        f"This work: {facts['scale']} scale, training of {steps} steps, training seeds per arm: {seeds}; "
+        f"This work: {facts['scale']} scale, training of {training(files)} steps, training seeds per arm: {seeds}; "
         f"{len(runs[0])} paired episodes of set {facts['episode_set'][:12]}; commit {facts['commit']}. "
         "Paper: as published."
     )
     return facts, note
-
-
-def _list(texts: Iterable[str]) -> str:
-    return ", ".join(sorted(set(texts)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 
 from romnav.evaluation.trials.rows import TrialRows
@@ -18,6 +17,7 @@ from romnav.evaluation.trials.statistics import (
 )
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
+from romnav.report.provenance import sources, training
 from romnav.world.scenes.scene import Scene
 
 SHARED = 10
@@ -172,16 +172,8 @@ def _title(run: TrialRows, labels: Mapping[str, str]) -> str:
 
 def _provenance(runs: Sequence[TrialRows], what: str) -> tuple[dict[str, str], str]:
     """Provenance of the runs, and the end of the caption that states it."""
-
-    def distinct(texts: Sequence[str]) -> str:
-        return ", ".join(sorted(set(texts)))
-
-    facts = {
-        "scale": distinct([run.provenance.scale for run in runs]),
-        "commit": distinct([re.sub(r"(?<=^\w{12})\w+", "", run.provenance.commit) for run in runs]),
-        "episode_set": distinct([run.provenance.episode_set for run in runs]),
-    }
-    steps = distinct([f"{run.provenance.steps / 1e6:.3g} M" for run in runs if run.provenance.steps])
+    files = [run.provenance for run in runs]
+    facts, steps = sources(files), training(files)
     trained = f"training of {steps} steps; " if steps else ""
     return (
         facts,

@@ -7,7 +7,8 @@ from tensordict import TensorDict
 
 from romnav.evaluation import episodes
 from romnav.evaluation.episodes import EpisodeSet
-from romnav.evaluation.rollout import Oracle, Policy, Straight, View, evaluate
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Oracle, Policy, Straight, View
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import EnvSpec, PolicySpec
@@ -48,7 +49,7 @@ def test_a_policy_with_its_own_encoder_is_shown_images() -> None:
 
 
 def test_oracle_reaches_nearly_every_goal_by_nearly_the_shortest_path(world: World, paired: EpisodeSet) -> None:
-    out = evaluate(Oracle(), world, paired, EnvSpec(), EvaluationSpec())
+    out = run(Oracle(), world, paired, EnvSpec(), EvaluationSpec())
     success = out["outcome"] == "success"
     geodesic = paired.columns["geodesic"]
     spl = np.mean(success * geodesic / np.maximum(geodesic, out["path_length"]))
@@ -61,7 +62,7 @@ def test_oracle_reaches_nearly_every_goal_by_nearly_the_shortest_path(world: Wor
 
 
 def test_straight_is_the_lower_bound(world: World, paired: EpisodeSet) -> None:
-    straight = evaluate(Straight(), world, paired, EnvSpec(), EvaluationSpec())["outcome"] == "success"
+    straight = run(Straight(), world, paired, EnvSpec(), EvaluationSpec())["outcome"] == "success"
     assert straight[~paired.cross].mean() > 0.25  # some goals lie in plain sight
     assert straight[paired.cross].mean() < 0.3
 
@@ -73,7 +74,7 @@ def test_two_evaluations_give_the_same_rows_at_any_thread_count(world: World, pa
         runs = []
         for count in (1, 1, 2):
             torch.set_num_threads(count)
-            runs.append(evaluate(policy(), world, paired, EnvSpec(), short))
+            runs.append(run(policy(), world, paired, EnvSpec(), short))
     finally:
         torch.set_num_threads(threads)
     for other in runs[1:]:
@@ -107,7 +108,7 @@ def test_measures_of_a_robot_that_stands_still(world: World, paired: EpisodeSet)
         def select(self, keep: torch.Tensor) -> None:
             pass
 
-    out = evaluate(Still(), world, paired, EnvSpec(), EvaluationSpec(duration=2.0))
+    out = run(Still(), world, paired, EnvSpec(), EvaluationSpec(duration=2.0))
     assert (out["outcome"] == "timeout").all()
     assert np.isnan(out["success_time"]).all()
     assert (out["time"] == 2.0).all()

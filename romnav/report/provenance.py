@@ -1,0 +1,27 @@
+"""Where the numbers of a table come from, for its caption and its CSV."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+from romnav.evaluation.rowfile import Provenance
+
+
+def sources(files: Sequence[Provenance]) -> dict[str, str]:
+    """Scale, commit and episode set of the files that a table is made of; several where they differ."""
+    return {
+        "scale": distinct(file.scale for file in files),
+        "commit": distinct(re.sub(r"(?<=^\w{12})\w+", "", file.commit) for file in files),
+        "episode_set": distinct(file.episode_set for file in files),
+    }
+
+
+def training(files: Sequence[Provenance]) -> str:
+    """Environment steps of the trained ones; empty where there are none."""
+    return distinct(f"{file.steps / 1e6:.3g} M" for file in files if file.steps)
+
+
+def distinct(texts: Iterable[str]) -> str:
+    """The texts that there are, each once."""
+    return ", ".join(sorted(set(texts)))
