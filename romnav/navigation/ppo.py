@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Generator
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -89,6 +89,21 @@ class BoundedPPO(PPO):
         low, high = self.learning_rate_range
         self._learning_rate = min(max(value, low), high)
 
+    def begin(self, share: float) -> None:
+        """Set everything that is scheduled once ``share`` of the run is done."""
+
+    def report(self) -> dict[str, float]:
+        """Columns of the learning curve beside the losses."""
+        return {}
+
+    def memories(self) -> dict[str, HiddenState]:
+        """What the networks remember of the running episodes."""
+        return {"memory": self.actor.get_hidden_state()}
+
+    def remember(self, memories: dict[str, Any]) -> None:
+        """Restore `memories`."""
+        self.actor.reset(hidden_state=memories["memory"])
+
     def unfreeze(self, encoder: Encoder, obs: TensorDict) -> None:
         """Train a copy of ``encoder`` with the policy from the next rollout on; ``obs`` now holds images."""
         self.actor.encoder = copy.deepcopy(encoder)
@@ -99,13 +114,18 @@ class BoundedPPO(PPO):
         )
 
 
+P = TypeVar("P", bound=BoundedPPO)
+
+
 def make_actor(obs: TensorDict, policy: PolicySpec) -> NavigationActor:
     """Policy network for the observations ``obs``."""
     return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy)
 
 
-def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str) -> BoundedPPO:
-    """Actor, critic, rollout and optimiser."""
+def make_ppo(
+    obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str, kind: type[P] = BoundedPPO
+) -> P:
+    """Actor, critic, rollout and optimiser, of the ``kind`` of PPO."""
     actor = make_actor(obs, policy).to(device)
     actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
     critic = PrivilegedCritic(
@@ -125,7 +145,7 @@ def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, devi
         "desired_kl": spec.desired_kl,
         "learning_rate": spec.learning_rate,
     }
-    ppo = BoundedPPO(actor, critic, storage, device=device, **options)
+    ppo = kind(actor, critic, storage, device=device, **options)
     # one pass over all parameters instead of ten per tensor
     ppo.optimizer = torch.optim.Adam(chain(actor.parameters(), critic.parameters()), spec.learning_rate, fused=True)
     ppo.learning_rate_range = spec.learning_rate_range
