@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import HiddenState
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -53,13 +54,13 @@ def inherit(student: NavigationActor, teacher: NavigationActor) -> None:
     """
     own, given = student.state_dict(), teacher.state_dict()
     for name, value in own.items():
-        taken = given.get(name)
-        if taken is None or taken.shape[:-1] != value.shape[:-1] or taken.shape[-1] > value.shape[-1]:
-            shape = None if taken is None else tuple(taken.shape)
+        taken = given.get(name, value)
+        if taken.shape[:-1] != value.shape[:-1] or taken.shape[-1] > value.shape[-1]:
             raise RomnavError(
-                f"kickstart.init: the teacher's {name} is {shape}, the student's {tuple(value.shape)}; "
+                f"kickstart.init: the teacher's {name} is {tuple(taken.shape)}, the student's {tuple(value.shape)}; "
                 "give both the same navigation.policy, or start from 'fresh'"
             )
+        taken = taken.clone()
         value.zero_()
         value[..., : taken.shape[-1]] = taken
 
@@ -90,7 +91,7 @@ class Teacher:
 
 
 class KickstartedPPO(BoundedPPO):
-    """PPO with the divergence from a teacher, where rsl-rl's `update` has its symmetry loss."""
+    """PPO with the divergence from a teacher as a further term of the loss."""
 
     teacher: Teacher
     places: Callable[[], Tensor]
@@ -105,15 +106,15 @@ class KickstartedPPO(BoundedPPO):
         """
         self.teacher, self.places = teacher, places
         self._entropy: float = self.entropy_coef
-        self.symmetry = _Divergence(teacher.spec)
+        self._divergence = self.symmetry.by_name["divergence"] = Divergence(teacher.spec)
         if teacher.spec.init == "teacher":
             inherit(self.actor, teacher.actor)
 
     def begin(self, share: float) -> None:
         """Set everything that is scheduled once ``share`` of the run is done."""
-        spec, term = self.teacher.spec, self.symmetry
-        term.mirror_loss_coeff, term.ppo = spec.weight(share), spec.ppo(share)
-        self.entropy_coef = self._entropy * term.ppo
+        spec = self.teacher.spec
+        self._divergence.coefficient, self.symmetry.surrogate = spec.weight(share), spec.ppo(share)
+        self.entropy_coef = self._entropy * self.symmetry.surrogate
         # without gradients the optimiser passes the actor by, and its moments stay untouched
         self.actor.requires_grad_(share >= spec.critic_first)
 
@@ -126,14 +127,10 @@ class KickstartedPPO(BoundedPPO):
         super().process_env_step(obs, rewards, dones, extras)
         self.teacher.actor.reset(dones)
 
-    def update(self) -> dict[str, float]:
-        """Losses of one iteration: those of PPO, and "divergence", unweighted."""
-        losses = super().update()
-        return {("divergence" if name == "symmetry" else name): value for name, value in losses.items()}
-
     def report(self) -> dict[str, float]:
         """Weights of this iteration, and the mean divergence by place since the last report, NaN where nobody was."""
-        return self.symmetry.report()
+        weights = {"lambda": self._divergence.coefficient, "ppo_weight": self.symmetry.surrogate}
+        return weights | self._divergence.by_place()
 
     def memories(self) -> dict[str, HiddenState]:
         """Of student and teacher."""
@@ -156,25 +153,18 @@ def blank_lesson(obs: TensorDict) -> TensorDict:
     return lesson(obs, torch.zeros(envs, 2, ACTIONS, device=obs.device), torch.zeros(envs, 2, device=obs.device))
 
 
-class _Divergence:
-    """The divergence from the teacher, in the part of the symmetry that rsl-rl's `PPO.update` calls."""
-
-    use_mirror_loss = True
+class Divergence:
+    """The divergence from the teacher, as a term of the loss."""
 
     def __init__(self, spec: KickstartSpec) -> None:
         self._spec = spec
-        self.mirror_loss_coeff = spec.weight(0.0)
-        self.ppo = spec.ppo(0.0)
+        self.coefficient = spec.weight(0.0)
         self._forget()
 
     def _forget(self) -> None:
         self._sums = torch.zeros(2, 1 + len(PLACES), dtype=torch.float64)
 
-    def augment_batch(self, batch: RolloutStorage.Batch, size: int) -> None:
-        """Scale PPO's objective, which is linear in the advantages."""
-        batch.advantages = batch.advantages * self.ppo
-
-    def compute_loss(self, actor: NavigationActor, batch: RolloutStorage.Batch, size: int) -> Tensor:
+    def loss(self, actor: MLPModel, batch: RolloutStorage.Batch) -> Tensor:
         """Mean divergence, nat, of the minibatch whose distributions ``actor`` has just computed."""
         student = torch.stack(actor.output_distribution_params, dim=-2)
         teacher = batch.observations["teacher"]
@@ -188,9 +178,9 @@ class _Divergence:
             self._sums += counted
         return each.mean()
 
-    def report(self) -> dict[str, float]:
+    def by_place(self) -> dict[str, float]:
+        """Means on the spawn's level and at `PLACES` since they were last asked for, NaN where nobody was."""
         total, count = self._sums
         means = (total / count).tolist()  # 0 / 0 is NaN
         self._forget()
-        names = [f"divergence_{place}" for place in ("same", *PLACES)]
-        return {"lambda": self.mirror_loss_coeff, "ppo_weight": self.ppo, **dict(zip(names, means, strict=True))}
+        return dict(zip([f"divergence_{place}" for place in ("same", *PLACES)], means, strict=True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Generator
 from itertools import chain
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -15,6 +15,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
+from romnav.navigation.guidance import Guidance
 from romnav.navigation.observations import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
 from romnav.navigation.spec import PolicySpec, PPOSpec
@@ -73,10 +74,57 @@ class PrivilegedCritic(MLPModel):
         return last(features.float())
 
 
+class Term(Protocol):
+    """A term of the loss beside PPO's own."""
+
+    coefficient: float
+
+    def loss(self, actor: MLPModel, batch: RolloutStorage.Batch) -> Tensor:
+        """Its mean, unweighted, over the minibatch that ``actor`` was just shown."""
+        ...
+
+
+class Terms:
+    """Further terms of the loss by name, in the part of the symmetry that rsl-rl's `PPO.update` asks.
+
+    Attributes:
+        surrogate: Factor of PPO's own objective.
+    """
+
+    use_mirror_loss = True
+    mirror_loss_coeff = 1.0
+
+    def __init__(self, by_name: dict[str, Term]) -> None:
+        self.by_name = by_name
+        self.surrogate = 1.0
+        self._seen: dict[str, list[float]] = {}
+
+    def __len__(self) -> int:
+        return len(self.by_name)
+
+    def augment_batch(self, batch: RolloutStorage.Batch, size: int) -> None:
+        """Scale the objective, which is linear in the advantages."""
+        batch.advantages = batch.advantages * self.surrogate
+
+    def compute_loss(self, actor: MLPModel, batch: RolloutStorage.Batch, size: int) -> Tensor:
+        """Weighted sum of the terms."""
+        losses = {name: term.loss(actor, batch) for name, term in self.by_name.items()}
+        for name, loss in losses.items():
+            self._seen.setdefault(name, []).append(loss.item())
+        return torch.stack([self.by_name[name].coefficient * loss for name, loss in losses.items()]).sum()
+
+    def means(self) -> dict[str, float]:
+        """Means of the terms, unweighted, since they were last asked for."""
+        means = {name: sum(seen) / len(seen) for name, seen in self._seen.items()}
+        self._seen = {}
+        return means
+
+
 class BoundedPPO(PPO):
-    """PPO whose adaptive learning rate stays within bounds."""
+    """PPO whose adaptive learning rate stays within bounds, and whose loss may have further terms."""
 
     learning_rate_range = (0.0, float("inf"))
+    symmetry: Terms
     storage: RolloutStorage
 
     @property
@@ -88,6 +136,12 @@ class BoundedPPO(PPO):
     def learning_rate(self, value: float) -> None:
         low, high = self.learning_rate_range
         self._learning_rate = min(max(value, low), high)
+
+    def update(self) -> dict[str, float]:
+        """One update; its mean losses by name."""
+        losses: dict[str, float] = super().update()
+        losses.pop("symmetry", None)
+        return losses | self.symmetry.means()
 
     def begin(self, share: float) -> None:
         """Set everything that is scheduled once ``share`` of the run is done."""
@@ -117,16 +171,16 @@ class BoundedPPO(PPO):
 P = TypeVar("P", bound=BoundedPPO)
 
 
-def make_actor(obs: TensorDict, policy: PolicySpec) -> NavigationActor:
-    """Policy network for the observations ``obs``."""
-    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy)
+def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> NavigationActor:
+    """Policy network for the observations ``obs``; one that is ``guided`` also guesses the way."""
+    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
 def make_ppo(
     obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str, kind: type[P] = BoundedPPO
 ) -> P:
     """Actor, critic, rollout and optimiser, of the ``kind`` of PPO."""
-    actor = make_actor(obs, policy).to(device)
+    actor = make_actor(obs, policy, guided=spec.guidance > 0.0).to(device)
     actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
     critic = PrivilegedCritic(
         obs, {"critic": ["critic"]}, "critic", 1, hidden_dims=list(policy.critic), obs_normalization=True
@@ -149,4 +203,5 @@ def make_ppo(
     # one pass over all parameters instead of ten per tensor
     ppo.optimizer = torch.optim.Adam(chain(actor.parameters(), critic.parameters()), spec.learning_rate, fused=True)
     ppo.learning_rate_range = spec.learning_rate_range
+    ppo.symmetry = Terms({"guidance": Guidance(spec.guidance)} if spec.guidance > 0.0 else {})
     return ppo
