@@ -356,7 +356,7 @@ class Stages:
 
     def world(self, spec: WorldSpec, progress: Progress | None = None) -> World:
         """Terrain, from the cache if it was built before."""
-        from romnav.world.world import build
+        from romnav.world.build import build
 
         return build(spec, self._worlds, progress)
 
@@ -400,5 +400,5 @@ class Stages:
 
         solids = [tile.solids for tile in tiles]
         if sensor == "lidar":
-            return Lidar(solids, settings.lidar, self.device)
+            return Lidar(solids, settings.lidar, self.device, self._worlds)
         return DepthCamera(solids, settings.depth, self.device)
