@@ -23,7 +23,7 @@ def ablation(job: DeviceJob, name: ExperimentArgument, seed: SeedOption = None) 
     reports = _reports(job.plan, "ablation", name, seed)
     stages = job.pending(reports, EVERYTHING)
     if job.device == "cpu":
-        job.perform([stage for stage in stages if stage.kind == "encoder"])
+        job.perform([stage for stage in stages if stage.kind in ("encoder", "gaits")])
         for kind in ("policy", "episodes"):
             stages_side_by_side(job.plan, [stage for stage in stages if stage.kind == kind], job.resume)
         stages = [stage for stage in stages if stage in reports]

@@ -24,11 +24,22 @@ def stages_side_by_side(plan: Plan, stages: Sequence[Stage], resume: bool) -> No
         RomnavError: One of them failed.
     """
     options = ["--scale", plan.scale.name, *([] if resume else ["--no-resume"])]
-    commands = {s.name: [*COMMANDS[s.kind], str(s.arm), "--seed", str(s.seed), *options] for s in stages}
-    if commands:
-        elsewhere = plan.project.results != plan.project.root / "results"
-        where = ["--results", str(plan.project.results)] if elsewhere else []
-        side_by_side({name: [*where, *command] for name, command in commands.items()}, os.cpu_count() or 1)
+    elsewhere = plan.project.results != plan.project.root / "results"
+    where = ["--results", str(plan.project.results)] if elsewhere else []
+    for wave in waves(stages):
+        commands = {s.name: [*where, *COMMANDS[s.kind], str(s.arm), "--seed", str(s.seed), *options] for s in wave}
+        side_by_side(commands, os.cpu_count() or 1)
+
+
+def waves(stages: Sequence[Stage]) -> list[list[Stage]]:
+    """Stages in the order of their waves: each needs none of its own wave or of a later one."""
+    left, done = list(stages), list[list[Stage]]()
+    while left:
+        names = {stage.name for stage in left}
+        ready = [stage for stage in left if not names & {above.name for above in stage.upstream}]
+        done.append(ready)
+        left = [stage for stage in left if stage not in ready]
+    return done
 
 
 def side_by_side(commands: Mapping[str, Sequence[str]], workers: int) -> None:

@@ -171,13 +171,19 @@ class Plan:
         return (self.locomotion(), self.gaits()) if settings.navigation.dynamics == "g1" else ()
 
     def policy(self, arm: str, seed: int) -> Stage:
-        """The trained policy of an arm, or of the one whose policy it drives."""
+        """The trained policy of an arm, or of the one whose policy it drives; a teacher is trained with the same seed.
+
+        Raises:
+            RomnavError: The teacher is no trained arm, or taught itself.
+        """
         arm = self.project.driver(arm)
         settings = self.settings(arm)
         pretrained, walks = settings.navigation.encoder.pretrained, settings.navigation.dynamics == "g1"
         encoders = [self.encoder(settings)] if pretrained else []
         if walks:
             encoders.append(self.encoder(settings, "depth"))
+        taught = settings.kickstart
+        teacher = [self._teacher(arm, taught.teacher, seed)] if taught else []
         folder = self.folder / arm / f"seed-{seed}"
         return Stage(
             kind="policy",
@@ -190,12 +196,22 @@ class Plan:
                 *("world", "lidar", "navigation"),
                 *(() if pretrained else ("pretrain.encoder",)),
                 *(("depth", "pretrain_depth.corruption") if walks else ()),
+                *(("kickstart",) if taught else ()),
             ),
-            upstream=(*encoders, *self._walking(settings)),
+            upstream=(*encoders, *teacher, *self._walking(settings)),
             scratch=("checkpoint.pt", "curve.csv"),
             arm=arm,
             seed=seed,
         )
+
+    def _teacher(self, arm: str, teacher: str, seed: int) -> Stage:
+        key = f"{self.project.file(self.project.having(arm)[0])}: arms.{arm}.kickstart.teacher"
+        trained = {a for e in self.project.experiments.values() for a, spec in e.arms.items() if not spec.policy}
+        if teacher not in trained:
+            raise RomnavError(f"{key}: no arm {teacher} that is trained{suggest(teacher, trained)}")
+        if self.settings(teacher).kickstart:
+            raise RomnavError(f"{key}: {teacher} has a teacher itself; name one that was trained by PPO alone")
+        return self.policy(teacher, seed)
 
     def episodes(self, arm: str, seed: int) -> Stage:
         """The evaluated episodes of a trained or scripted arm."""

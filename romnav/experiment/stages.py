@@ -171,6 +171,7 @@ class Stages:
         settings = cast(Scale, stage.settings)
         world = self.world(settings.world, progress)
         perception = self._perception(stage, settings, world, stage.seed or 0)
+        teachers = [above.folder / "policy.pt" for above in stage.upstream if above.kind == "policy"]
         path = train(
             settings.navigation,
             world,
@@ -178,6 +179,7 @@ class Stages:
             stage.folder,
             stage.seed or 0,
             body=self._body(stage, settings.navigation.ppo.threads),
+            kickstart=None if settings.kickstart is None else (settings.kickstart, teachers[0]),
             device=self.device,
             resume=self.resume,
             progress=progress,

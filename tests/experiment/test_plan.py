@@ -225,3 +225,45 @@ def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> No
     assert changed == {"locomotion", "gait library", "tables humanoid"} | walking
     with pytest.raises(RomnavError, match=r"arms\.walked\.policy: trials drive .*; name rom in its place"):
         here.trials("safety", "walked", 0)
+
+
+KICKSTART = """
+kind = "ablation"
+title = "taught"
+tables = ["nav-perf"]
+[arms.rom]
+label = "RoM"
+[arms.nav]
+label = "taught"
+navigation.dynamics = "g1"
+kickstart.teacher = "%s"
+kickstart.concentration = 20.0
+[arms.nav-hum]
+label = "driven"
+policy = "rom"
+navigation.dynamics = "g1"
+"""
+
+
+def test_a_teacher_is_upstream_of_its_student_with_the_same_seed(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % "rom")
+    taught = here.policy("nav", 3)
+    assert here.policy("rom", 3) in taught.upstream
+    assert taught.spec["kickstart"]["concentration"] == 20.0
+    assert "kickstart" not in here.policy("rom", 3).spec
+    assert here.episodes("nav", 3).upstream[-1] == taught
+    softer = plan(tmp_path / "softer")
+    softer.project.file("kickstart").write_text(KICKSTART.replace("20.0", "10.0") % "rom")
+    assert softer.policy("nav", 3).key != taught.key
+    assert softer.policy("rom", 3).key == here.policy("rom", 3).key
+
+
+@pytest.mark.parametrize(
+    ("teacher", "match"), [("nav-hum", "no arm nav-hum"), ("oracle", "no arm oracle"), ("nav", "has a teacher itself")]
+)
+def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: str) -> None:
+    here = plan(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % teacher)
+    with pytest.raises(RomnavError, match=f"arms.nav.kickstart.teacher: .*{match}"):
+        here.policy("nav", 0)
