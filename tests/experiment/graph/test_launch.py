@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from romnav.errors import RomnavError
-from romnav.experiment.launch import side_by_side
+from romnav.experiment.graph.launch import side_by_side
 
 
 def test_commands_run_in_processes_of_their_own(capfd: pytest.CaptureFixture[str]) -> None:
