@@ -78,7 +78,7 @@ def load_actor(
         seen = {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, state)}
         if has_depth and depth_encoder is not None:
             seen["depth"] = torch.zeros(1, *depth_encoder.token_shape)
-        actor = make_actor(TensorDict(seen, batch_size=[1]), spec.policy)
+        actor = make_actor(TensorDict(seen, batch_size=[1]), spec.policy, guided=spec.ppo.guidance > 0.0)
         if own:
             actor.encoder = copy.deepcopy(encoder)
         actor.load_state_dict(content["actor"])

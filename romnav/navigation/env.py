@@ -138,6 +138,7 @@ class NavigationEnv(VecEnv):
             d.position,
             d.yaw,
             self._geodesic,
+            self._best[:, 0],
             self._direction,
             remaining,
             (self._since_arrival >= 0).to(torch.float32),

@@ -20,7 +20,7 @@ GOAL_SIZE = 6
 ACTIONS = 3
 STATE_SIZE = GOAL_SIZE + ACTIONS
 """Non-visual observation on the reduced-order model; on the humanoid, proprioception follows."""
-PRIVILEGED_SIZE = PATCH * PATCH + 7
+PRIVILEGED_SIZE = PATCH * PATCH + 8
 Perceive = Callable[[Dynamics, Tensor], dict[str, Tensor]]
 """(robots, counters (E, 2) naming environment and step) -> tokens or images (E, ...) by sensor."""
 
@@ -103,19 +103,31 @@ class PrivilegedObservation:
         position: Tensor,
         yaw: Tensor,
         geodesic: Tensor,
+        best: Tensor,
         direction: Tensor,
         remaining: Tensor,
         arrived: Tensor,
         cross: Tensor,
     ) -> Tensor:
-        """(E, `PRIVILEGED_SIZE`). ``direction`` (E, 2) of the shortest path, tile frame; ``remaining`` in [0, 1]."""
+        """(E, `PRIVILEGED_SIZE`).
+
+        ``best`` is the least geodesic so far, beyond which alone progress pays; ``direction`` (E, 2) of the shortest
+        path in the tile frame; ``remaining`` in [0, 1].
+        """
         heading = rotate(direction, yaw)
         points = position[:, None, :2] + rotate(self.offsets.expand(len(yaw), -1, -1), -yaw)
         count = len(self.offsets)
         node = self.world.node_at(tile.repeat_interleave(count), layer.repeat_interleave(count), points.reshape(-1, 2))
         occupied = (node < 0).view(len(yaw), count).to(torch.float32)
         scalars = torch.stack(
-            [geodesic / 30.0, torch.log(geodesic.clamp(min=0.05)), remaining, arrived, cross, heading[:, 0]],
+            [geodesic / 30.0, torch.log(geodesic.clamp(min=0.05)), remaining, arrived, cross, (geodesic - best) / 30.0],
             dim=1,
         )
-        return torch.cat([scalars, heading[:, 1:2], occupied], dim=1)
+        return torch.cat([scalars, heading, occupied], dim=1)
+
+
+def privileged_way(critic: Tensor) -> tuple[Tensor, Tensor]:
+    """Direction (..., 2) of the shortest path in the robot's frame, and log of its length in m, of the critic's
+    observations (..., C), which end in a `PrivilegedObservation`."""
+    privileged = critic[..., -PRIVILEGED_SIZE:]
+    return privileged[..., 6:8], privileged[..., 1]

@@ -166,6 +166,7 @@ class NavigationActor(MLPModel):
         obs_set: str,
         output_dim: int,
         spec: PolicySpec,
+        guided: bool = False,
     ) -> None:
         tokens, channels = obs["lidar"].shape[1:]
         embedding = 64
@@ -184,9 +185,13 @@ class NavigationActor(MLPModel):
         self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + BEARING, embedding), nn.ELU())
         self.attention = Attention(tokens, channels, embedding, spec)
         self.core = RecurrentCore(seen, spec.recurrent)
+        self.way = nn.Linear(self._latent, 3) if guided else None
+        """Guesses where the shortest path leads (`romnav.navigation.guidance`)."""
         self.encoder: Encoder | None = None
         """Encoder of its own; then "lidar" are images (B, rows, columns) in m, otherwise tokens of a frozen one."""
         self._hidden: Tensor | None = None
+        self.guess = torch.empty(0)
+        """(T, B, 3) direction and log of the length of the shortest path, as guessed in the last update."""
 
     def forward(
         self,
@@ -199,6 +204,8 @@ class NavigationActor(MLPModel):
         with reduced_precision(obs["state"].device):
             latent = self.get_latent(obs, masks, hidden_state)
             features = self.mlp[1](self.mlp[0](latent))
+        if self.way is not None and masks is not None:
+            self.guess = self.way(latent.float())
         parameters = self.mlp[3](self.mlp[2](features.float()))
         if not stochastic_output:
             return self.distribution.deterministic_output(parameters)

@@ -15,6 +15,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
+from romnav.navigation.guidance import Guidance
 from romnav.navigation.observations import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
 from romnav.navigation.spec import PolicySpec, PPOSpec
@@ -89,6 +90,11 @@ class BoundedPPO(PPO):
         low, high = self.learning_rate_range
         self._learning_rate = min(max(value, low), high)
 
+    def update(self) -> dict[str, float]:
+        """One update; its mean losses by name."""
+        losses: dict[str, float] = super().update()
+        return {"guidance" if name == "symmetry" else name: value for name, value in losses.items()}
+
     def unfreeze(self, encoder: Encoder, obs: TensorDict) -> None:
         """Train a copy of ``encoder`` with the policy from the next rollout on; ``obs`` now holds images."""
         self.actor.encoder = copy.deepcopy(encoder)
@@ -99,14 +105,14 @@ class BoundedPPO(PPO):
         )
 
 
-def make_actor(obs: TensorDict, policy: PolicySpec) -> NavigationActor:
-    """Policy network for the observations ``obs``."""
-    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy)
+def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> NavigationActor:
+    """Policy network for the observations ``obs``; one that is ``guided`` also guesses the way."""
+    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
 def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str) -> BoundedPPO:
     """Actor, critic, rollout and optimiser."""
-    actor = make_actor(obs, policy).to(device)
+    actor = make_actor(obs, policy, guided=spec.guidance > 0.0).to(device)
     actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
     critic = PrivilegedCritic(
         obs, {"critic": ["critic"]}, "critic", 1, hidden_dims=list(policy.critic), obs_normalization=True
@@ -129,4 +135,6 @@ def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, devi
     # one pass over all parameters instead of ten per tensor
     ppo.optimizer = torch.optim.Adam(chain(actor.parameters(), critic.parameters()), spec.learning_rate, fused=True)
     ppo.learning_rate_range = spec.learning_rate_range
+    if spec.guidance > 0.0:
+        ppo.symmetry = Guidance(spec.guidance)
     return ppo

@@ -130,6 +130,9 @@ class PPOSpec(Config):
     """Entropy coefficient (A)."""
     value: float = 1.0
     """Value-loss coefficient (A)."""
+    guidance: float = 0.0
+    """Coefficient of the loss of guessing where the shortest path leads, and how long it is, from what the policy has
+    seen (P: none; A: trains the memory on every step, where reward is rare)."""
     learning_rate: float = 1e-3
     """Initial learning rate (A)."""
     learning_rate_range: tuple[float, float] = (1e-4, 1e-2)

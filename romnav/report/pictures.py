@@ -47,7 +47,7 @@ def draw_tile(tile: Tile, grids: Grids, path: Path, *, azimuth: float = -60.0, e
     axes.set_axis_off()
     axes.set_title(f"{tile.kind} {tile.index}")
     for layer in range(layers):
-        _draw_grid(figure.add_subplot(spec[layer // columns, 1 + layer % columns]), tile, grids, layer)
+        draw_grid(figure.add_subplot(spec[layer // columns, 1 + layer % columns]), tile, grids, layer)
     handles = [Patch(color=COLOURS[k], label=k.name.lower()) for k in (Label.GROUND, Label.STAIR, Label.RAMP)]
     handles += [
         Patch(color=OCCUPIED, label="occupied"),
@@ -57,7 +57,8 @@ def draw_tile(tile: Tile, grids: Grids, path: Path, *, azimuth: float = -60.0, e
     figure.savefig(path, dpi=150)
 
 
-def _draw_grid(axes: Axes, tile: Tile, grids: Grids, layer: int) -> None:
+def draw_grid(axes: Axes, tile: Tile, grids: Grids, layer: int) -> None:
+    """Draw the free and occupied cells of a layer, with the centre lines of the stairs and ramps that touch it."""
     height, label, free = grids.height[layer], grids.label[layer], grids.free[layer]
     image = np.ones((*height.shape, 3))
     image[label >= 0] = to_rgb(OCCUPIED)

@@ -12,6 +12,7 @@ from romnav.navigation.observations import (
     PrivilegedObservation,
     goal_observation,
     observe,
+    privileged_way,
     rotate,
 )
 from romnav.navigation.perception import Eye, Perception
@@ -60,12 +61,15 @@ def test_privileged_patch_is_the_occupancy_around_the_robot(world: World) -> Non
     yaw = torch.tensor([0.4])
     one = torch.ones(1)
     out = PrivilegedObservation(world)(
-        tile, layer, position, yaw, 4 * one, torch.tensor([[math.cos(0.4), math.sin(0.4)]]), one, one, one
+        tile, layer, position, yaw, 4 * one, one, torch.tensor([[math.cos(0.4), math.sin(0.4)]]), one, one, one
     )[0]
     assert out.shape == (PRIVILEGED_SIZE,)
+    assert out[5].item() == pytest.approx(0.1)  # 3 m further than it has been
     # the path leads straight ahead
-    assert out[5:7].tolist() == pytest.approx([1.0, 0.0], abs=1e-6)
-    patch = out[7:].view(PATCH, PATCH)
+    direction, log_geodesic = privileged_way(torch.cat([torch.zeros(9), out]))
+    assert direction.tolist() == pytest.approx([1.0, 0.0], abs=1e-6)
+    assert log_geodesic.item() == pytest.approx(math.log(4.0))
+    patch = out[8:].view(PATCH, PATCH)
     for i in range(PATCH):
         for j in range(PATCH):
             ahead, left = 0.4 * (i - PATCH // 2), 0.4 * (j - PATCH // 2)
