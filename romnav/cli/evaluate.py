@@ -70,7 +70,8 @@ def evaluate(
             return
     stages = [episodes(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
     for stage in stages:
-        for policy in (above for above in stage.upstream if above.kind == "policy"):
+        driver = job.project.driver(str(stage.arm))
+        for policy in (above for above in stage.upstream if (above.kind, above.arm) == ("policy", driver)):
             require(policy, stage)
     job.make(stages)
     _print_results(_collect(job), names, paired)
