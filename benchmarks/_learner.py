@@ -19,8 +19,9 @@ from romnav.robot.rom import ReducedOrderModel
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.lidar import Lidar
+from romnav.world.build import build
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 CACHE = ROOT / ".cache/bench"
 

@@ -25,7 +25,8 @@ from romnav.experiment.scales import Scale
 from romnav.navigation import checkpoint
 from romnav.sensing import encoder as encoders
 from romnav.sensing.lidar import Lidar
-from romnav.world.world import World, build
+from romnav.world.build import build
+from romnav.world.world import World
 
 RESAMPLES = 10_000
 

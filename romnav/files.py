@@ -27,7 +27,7 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
     Raises:
         RomnavError: The folder cannot be written or the disk is full; the old file is untouched.
     """
-    part = path.with_name(f".{path.name}.tmp")
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -26,7 +26,7 @@ def episodes(
     """Draw a new set of paired episodes; existing ones are never replaced."""
     from romnav.evaluation import episodes
     from romnav.evaluation.spec import EpisodeSetSpec
-    from romnav.world.world import build
+    from romnav.world.build import build
 
     path = here.project.root / "experiments" / "episodes" / f"{name}.json"
     if path.exists():

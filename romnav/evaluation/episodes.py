@@ -16,10 +16,11 @@ from pydantic import ValidationError
 from romnav import files
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import EpisodeSetSpec
+from romnav.world.build import build
 from romnav.world.geodesic import UNIT
 from romnav.world.spawns import Start, is_cross_level, sample
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 VERSION = 1
 CANDIDATES = 16

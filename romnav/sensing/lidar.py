@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Literal, overload
 
 import numpy as np
@@ -32,12 +33,15 @@ class Lidar:
         solids: The solids of each tile.
         spec: Image and sensor.
         device: Where to compute, "cpu" or "cuda".
+        cache: Folder where the lists of what can be seen from where are kept, which take long to make.
     """
 
     directions: Tensor
     """(rows, columns, 3) unit vectors in the levelled LiDAR frame (x forward, y left, z up)."""
 
-    def __init__(self, solids: Sequence[Solids], spec: LidarSpec, device: str = "cpu") -> None:
+    def __init__(
+        self, solids: Sequence[Solids], spec: LidarSpec, device: str = "cpu", cache: Path | None = None
+    ) -> None:
         self.spec = spec
         self.device = device
         width = math.radians(spec.azimuth)
@@ -81,7 +85,7 @@ class Lidar:
         else:
             packed = np.concatenate([columns.pack(s) for s in solids])
             slopes = math.tan(elevation[-1]), math.tan(elevation[0])
-            places = visibility.find(solids, slopes, spec.max_range, device)
+            places = visibility.find(solids, slopes, spec.max_range, device, cache)
             self._scene = [wp.array(packed, dtype=columns.Solid, device=device), places]
         wp.load_module(columns, device=device)
 

@@ -9,12 +9,17 @@ position of the place. So an image drawn from the list equals the image drawn fr
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from romnav import arrays
 from romnav.kernels import wp
 from romnav.world.solids import Shape, Solids
 
@@ -30,6 +35,10 @@ HEADROOM = 2.0
 """Places reach this far above the highest solid's underside that can carry a robot, m."""
 SLACK = wp.constant(1.0e-3)
 """By which bounds are widened, m: rounding may not hide what the exact tests would see."""
+
+
+TYPES = {"first": wp.int32, "corner": wp.vec3, "count": wp.vec3i, "start": wp.int32, "solid": wp.int32}
+"""Elements of the arrays of `Places`."""
 
 
 @wp.struct
@@ -153,7 +162,9 @@ def _find(
             seen[place, s] = wp.uint8(1)
 
 
-def find(tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float, device: str) -> Places:
+def find(
+    tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float, device: str, cache: Path | None = None
+) -> Places:
     """Places of ``tiles`` and what may be seen from them.
 
     Args:
@@ -161,7 +172,36 @@ def find(tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float,
         slopes: Least and largest slope of the sensor's rays.
         max_range: Range of the sensor, m.
         device: Where the lists will be used; they are found on the CPU.
+        cache: Folder where they are kept; a stale, foreign or torn file in it is made anew.
     """
+    key = _key(tiles, slopes, max_range)
+    path = cache / f"visibility-{key}.safetensors" if cache else None
+    stored = arrays.load(path) if path else None
+    if stored and stored[1] == key and stored[0].keys() == TYPES.keys():
+        lists = stored[0]
+    else:
+        lists = _lists(tiles, slopes, max_range)
+        if path:
+            arrays.save(path, lists, key)
+    places = Places()
+    for name, dtype in TYPES.items():
+        setattr(places, name, wp.array(lists[name], dtype=dtype, device=device))
+    places.size = wp.vec3(*PLACE)
+    return places
+
+
+def _key(tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float) -> str:
+    """Digest of everything that the lists depend on, this file included."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    digest.update(json.dumps([slopes, max_range, [len(solids) for solids in tiles]]).encode())
+    for solids in tiles:
+        for field in fields(solids):
+            digest.update(np.ascontiguousarray(getattr(solids, field.name)).data)
+    return digest.hexdigest()[:16]
+
+
+def _lists(tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float) -> dict[str, NDArray]:
+    """The arrays of `Places`."""
     size = np.array(PLACE)
     corners, counts, lengths, lists = [], [], [], []
     offset = 0
@@ -184,15 +224,13 @@ def find(tiles: Sequence[Solids], slopes: tuple[float, float], max_range: float,
         corners.append(corner)
         counts.append(count)
         offset += len(solids)
-    places = Places()
-    first = np.cumsum([0, *(len(n) for n in lengths)])
-    places.first = wp.array(first, dtype=wp.int32, device=device)
-    places.corner = wp.array(np.array(corners), dtype=wp.vec3, device=device)
-    places.count = wp.array(np.array(counts), dtype=wp.vec3i, device=device)
-    places.start = wp.array(np.append(0, np.cumsum(np.concatenate(lengths))), dtype=wp.int32, device=device)
-    places.solid = wp.array(np.concatenate(lists), dtype=wp.int32, device=device)
-    places.size = wp.vec3(*size)
-    return places
+    return {
+        "first": np.cumsum([0, *map(len, lengths)], dtype=np.int32),
+        "corner": np.array(corners, np.float32),
+        "count": np.array(counts, np.int32),
+        "start": np.append(0, np.cumsum(np.concatenate(lengths))).astype(np.int32),
+        "solid": np.concatenate(lists),
+    }
 
 
 def _bounds(solids: Solids) -> tuple[NDArray, NDArray]:

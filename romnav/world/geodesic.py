@@ -464,7 +464,8 @@ def _corners(surface: dict[str, NDArray[np.int32]], half: float) -> tuple[NDArra
 class Paths:
     """`Geodesics` of all tiles, end to end, with the offsets of each goal, and the nodes of all tiles."""
 
-    source: wp.array[wp.uint16]
+    source: wp.array[wp.int16]
+    """The bits of uint16: the only integers of this width that Torch and Warp share."""
     source_offset: wp.array[wp.int64]
     reach: wp.array[wp.float32]
     reach_offset: wp.array[wp.int64]
@@ -480,7 +481,7 @@ class Paths:
 @wp.func
 def bend(paths: Paths, goal: wp.int64, node: wp.int64, clearance: float):
     """Where the path from ``node`` first bends (x, y), ``clearance`` off the corner; its distance to the goal."""
-    source = wp.int64(paths.source[paths.source_offset[goal] + node])
+    source = wp.int64(wp.uint16(paths.source[paths.source_offset[goal] + node]))
     if source == wp.int64(65535):
         return wp.vec3(paths.goal[goal][0], paths.goal[goal][1], 0.0)
     corner = paths.corner_offset[goal] + source
@@ -554,29 +555,27 @@ class GeodesicLookup:
 
     def __init__(self, world: World) -> None:
         self._world = world
-        nodes, goals = world.node_start, world.goal_start
-        tile = torch.repeat_interleave(torch.arange(len(world.grids)), goals.diff().cpu())
-        solved = world.paths
+        tile = torch.repeat_interleave(world.goal_start.diff())
+        nodes, corners = world.node_start, world.corner_start
         links = [_links(g) for g in world.grids]
         links = [np.where(link >= 0, link + n, -1) for link, n in zip(links, nodes.tolist(), strict=False)]
-        corners = np.cumsum([0] + [len(p.corner) for p in solved])
-        count = np.diff(corners)[tile]
-        position = world.position[:, :2].cpu().numpy()
+        count = corners.diff()[tile]
+        position = world.position[:, :2].contiguous()
         self._paths = Paths()
         self._paths.cell = world.cell
         for key, value, kind in (
-            ("source", np.concatenate([p.source.ravel() for p in solved]), wp.uint16),
-            ("source_offset", (world.field_start - nodes[tile]).cpu().numpy(), wp.int64),
-            ("reach", np.concatenate([p.reach.ravel() for p in solved]), wp.float32),
-            ("reach_offset", np.cumsum(count) - count, wp.int64),
-            ("corner", np.concatenate([p.corner for p in solved]), wp.vec2),
-            ("outward", np.concatenate([p.outward for p in solved]), wp.vec2),
+            ("source", world.bends.view(torch.int16), wp.int16),
+            ("source_offset", world.field_start - nodes[tile], wp.int64),
+            ("reach", world.reach, wp.float32),
+            ("reach_offset", count.cumsum(0) - count, wp.int64),
+            ("corner", world.corner, wp.vec2),
+            ("outward", world.outward, wp.vec2),
             ("corner_offset", corners[tile], wp.int64),
-            ("goal", position[world.goal.cpu().numpy()], wp.vec2),
+            ("goal", position[world.goal], wp.vec2),
             ("position", position, wp.vec2),
-            ("link", np.concatenate(links), wp.int32),
+            ("link", torch.from_numpy(np.concatenate(links)).to(position.device), wp.int32),
         ):
-            setattr(self._paths, key, wp.array(value, dtype=kind, device=str(world.node.device)))
+            setattr(self._paths, key, wp.from_torch(value, dtype=kind))
         self._nearest = torch.from_numpy(_nearest_free(world.node.cpu().numpy())).to(world.node.device)
 
     def __call__(self, tile: Tensor, layer: Tensor, xy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:

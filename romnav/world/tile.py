@@ -54,6 +54,8 @@ class Tile:
     storeys: tuple[int, ...]
     """Layers that are floors, every one of them to be reachable from every other."""
     connectors: tuple[Connector, ...]
+    draws: int = 1
+    """Number of draws that it took until all of it was reachable."""
 
     @property
     def multi_story(self) -> bool:

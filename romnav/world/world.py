@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,17 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from romnav.world.geodesic import Geodesics, solve
+from romnav.world.geodesic import solve
 from romnav.world.grids import Grids
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Tile
-from romnav.world.tiles import generate
 
 LEVEL_GAP = 0.5
 """Heights further apart than this are different levels, m (A: above every curb, below every platform with stairs)."""
 MOUTH_RADIUS = 1.0
 """A spawn this near to the end of a stair or ramp is at its mouth, m (A)."""
-CACHE_VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -66,8 +59,18 @@ class World:
     """(G,) int64 offset of each goal's field in `fields`."""
     fields: Tensor
     """(sum over goals of the tile's nodes,) uint16 planar geodesic distances, in `geodesic.UNIT`."""
-    paths: tuple[Geodesics, ...]
-    """The same as paths, tile by tile, for `geodesic.GeodesicLookup`."""
+    bends: Tensor
+    """uint16, as `fields`: the corner of the goal's tile at which the path first bends, `geodesic.GOAL` if at none."""
+    corner: Tensor
+    """(C, 2) float32 corners of all tiles, tile after tile, m."""
+    outward: Tensor
+    """(C, 2) float32 signs of x and y away from the occupied cell of each corner."""
+    corner_start: Tensor
+    """(T + 1,) int64 first corner of each tile."""
+    reach: Tensor
+    """(sum over goals of the tile's corners,) float32 distance of each corner to the goal, m, goal after goal."""
+    seconds: float = 0.0
+    """Time that generating it took, s."""
 
     @property
     def cell(self) -> float:
@@ -78,6 +81,12 @@ class World:
         """The same world with its tensors on ``device``."""
         moved: dict[str, Any] = {k: v.to(device) for k, v in self.__dict__.items() if isinstance(v, Tensor)}
         return replace(self, **moved)
+
+    def field(self, goal: int) -> Tensor:
+        """(nodes of its tile,) uint16 distance to a goal from every node of its tile, in `geodesic.UNIT`."""
+        tile = int(torch.searchsorted(self.goal_start, goal, right=True)) - 1
+        nodes = int(self.node_start[tile + 1] - self.node_start[tile])
+        return self.fields[int(self.field_start[goal]) :][:nodes]
 
     def index(self, xy: Tensor) -> Tensor:
         """(E, 2) int64 cells of positions (E, 2), clamped to the tile: the only place that turns one into the other."""
@@ -95,71 +104,11 @@ class World:
         return self.height[tile, layer, cell[:, 0], cell[:, 1]]
 
 
-def build(spec: WorldSpec, cache: Path | None = None, progress: Callable[[int, int, str], None] | None = None) -> World:
-    """Generate the tiles of ``spec``, choose their goals and compute every goal's geodesic field.
-
-    Goals are drawn uniformly over the free cells of floors, off stairs, ramps and half landings, half of the draws
-    per level rather than per cell so that small levels are goals too. ``cache`` is a folder for the finished world;
-    a stale or torn file in it is made anew.
-    """
-    path = cache / f"world-{_key(spec)}.pkl" if cache else None
-    if path and path.exists():
-        try:
-            with path.open("rb") as file:
-                stored: dict[str, Any] = pickle.load(file)
-            tensors = {k: torch.from_numpy(v) for k, v in stored.items() if isinstance(v, np.ndarray)}
-            return World(**(stored | tensors))
-        except (pickle.UnpicklingError, EOFError):
-            path.unlink()
-    tiles, grids, goals = [], [], []
-    for i in range(spec.tiles):
-        tile, grid = generate(spec, i)
-        tiles.append(tile)
-        grids.append(grid)
-        goals.append(_draw_goals(spec, tile, grid))
-        if progress:
-            progress(i + 1, 2 * spec.tiles, "tiles")
-    world = pack(spec, tiles, grids, goals, progress)
-    if path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(f".{os.getpid()}.tmp")
-        # as arrays: torch does not unpickle its own unsigned 16-bit tensors
-        stored = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in world.__dict__.items()}
-        with temporary.open("wb") as file:
-            pickle.dump(stored, file, protocol=5)
-        temporary.replace(path)
-    return world
-
-
-def _key(spec: WorldSpec) -> str:
-    text = json.dumps([CACHE_VERSION, _source_digest(), spec.model_dump(mode="json")], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _source_digest() -> str:
-    """Digest of this package's source: a cached world never outlives the code that made it."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def _draw_goals(spec: WorldSpec, tile: Tile, grid: Grids) -> NDArray[np.intp]:
-    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([spec.seed, tile.index, 0x60A1])))
-    flat = np.flatnonzero(~grid.connector & np.isin(grid.layer, tile.storeys))
-    level = np.round(grid.position[flat, 2] / LEVEL_GAP).astype(int)
-    _, inverse, count = np.unique(level, return_inverse=True, return_counts=True)
-    weight = 0.5 / len(flat) + 0.5 / (len(count) * count[inverse])
-    size = min(spec.goals_per_tile, len(flat))
-    return np.sort(rng.choice(flat, size, replace=False, p=weight / weight.sum()))
-
-
 def pack(
     spec: WorldSpec,
     tiles: Sequence[Tile],
     grids: Sequence[Grids],
     goals: Sequence[NDArray],
-    progress: Callable[[int, int, str], None] | None = None,
 ) -> World:
     """Pack tiles, their grids and their goals (local node ids per tile) into a `World`."""
     count = grids[0].node.shape[-1]
@@ -176,9 +125,7 @@ def pack(
         height[t, :n] = g.height
         switch[t, 1:n] = g.switch
         spawn.append(np.flatnonzero(_stair_spawns(tile, g)) + node_start[t])
-    paths = tuple(solve(list(grids), [np.asarray(g) for g in goals]))
-    if progress:
-        progress(2 * len(tiles), 2 * len(tiles), "geodesic fields")
+    paths = solve(list(grids), [np.asarray(g) for g in goals])
     per_goal = np.repeat([len(g.position) for g in grids], [len(g) for g in goals])
     return World(
         spec=spec,
@@ -197,7 +144,11 @@ def pack(
         goal_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(g) for g in goals])])),
         field_start=torch.from_numpy(np.concatenate([[0], np.cumsum(per_goal)[:-1]])),
         fields=torch.from_numpy(np.concatenate([p.distance.ravel() for p in paths])),
-        paths=paths,
+        bends=torch.from_numpy(np.concatenate([p.source.ravel() for p in paths])),
+        corner=torch.from_numpy(np.concatenate([p.corner for p in paths])),
+        outward=torch.from_numpy(np.concatenate([p.outward for p in paths])),
+        corner_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(p.corner) for p in paths])])),
+        reach=torch.from_numpy(np.concatenate([p.reach.ravel() for p in paths])),
     )
 
 

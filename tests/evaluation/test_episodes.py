@@ -10,8 +10,9 @@ from romnav.errors import RomnavError
 from romnav.evaluation import episodes
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.spec import EpisodeSetSpec
+from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 SPEC = EpisodeSetSpec(
     world=WorldSpec(tiles=3, seed=41, goals_per_tile=8),

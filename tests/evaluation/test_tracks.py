@@ -12,8 +12,8 @@ from romnav.evaluation.paired.run import run
 from romnav.evaluation.rollout import Oracle
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.navigation.spec import EnvSpec
+from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
-from romnav.world.world import build
 
 SPEC = EpisodeSetSpec(
     world=WorldSpec(tiles=2, seed=52, goals_per_tile=16),

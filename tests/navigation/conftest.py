@@ -10,8 +10,9 @@ from romnav.navigation.spec import EnvSpec, NavigationSpec, PolicySpec, PPOSpec
 from romnav.robot.dynamics import Dynamics
 from romnav.sensing.encoder import Encoder, untrained
 from romnav.sensing.spec import EncoderSpec
+from romnav.world.build import build
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 TOKENS = (4, 8)
 

@@ -24,8 +24,9 @@ from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train as train_locomotion
 from romnav.robot.rom import ReducedOrderModel
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 from .conftest import TOKENS, FakePerception, fake_encoder
 
@@ -80,7 +81,7 @@ def test_killed_and_resumed_equals_left_alone(
         from romnav.navigation import train
         from romnav.navigation.spec import NavigationSpec
         from romnav.world.spec import WorldSpec
-        from romnav.world.world import build
+        from romnav.world.build import build
         train.SAVE_EVERY = 0.0
         def progress(done, total, metric):
             if done == 3 * total // 4:

@@ -16,10 +16,11 @@ from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+from romnav.world.build import build
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 SPEC = LocomotionSpec(
     task=TaskSpec(robots=4, shares={"flat": 1.0}), ppo=PpoSpec(steps=2, epochs=1, minibatches=1), iterations=1

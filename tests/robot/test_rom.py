@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from romnav.robot.rom import ReducedOrderModel
+from romnav.world.build import build
 from romnav.world.spawns import Start
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 
 @pytest.fixture(scope="module")

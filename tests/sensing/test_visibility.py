@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -35,7 +38,9 @@ def poses(tiles: list[tuple[Solids, Grids]], count: int) -> tuple[Tensor, Tensor
     return torch.from_numpy(tile.astype(np.int32)), torch.from_numpy(at).float(), torch.from_numpy(yaw).float()
 
 
-def everything(tiles: list[Solids], slopes: tuple[float, float], max_range: float, device: str) -> visibility.Places:
+def everything(
+    tiles: list[Solids], slopes: tuple[float, float], max_range: float, device: str, cache: Path | None
+) -> visibility.Places:
     """One place a tile, which is everywhere, with all of its solids."""
     places = find(tiles, slopes, max_range, device)
     counts = np.array([len(solids) for solids in tiles])
@@ -97,3 +102,35 @@ def test_slab_hides_what_is_below_unless_it_has_a_hole(hole: bool, seen: bool) -
     else:
         b.box((10.0, 10.0), (20.0, 20.0), (3.8, 4.0), label=Label.GROUND, layers=(1, 1))
     assert lists_ball(b, (13.0, 10.0, 5.3)) == seen
+
+
+def test_lists_are_kept_by_what_they_depend_on_and_made_anew_where_the_file_is_no_good(
+    tiles: list[tuple[Solids, Grids]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solids = [tiles[0][0]]
+    made = []
+    lists = visibility._lists
+    monkeypatch.setattr(visibility, "_lists", lambda *of: made.append(of) or lists(*of))
+    begun = find(solids, (-2.0, 0.2), 30.0, "cpu")
+
+    def same(*of: object) -> bool:
+        """Whether the lists from the cache are those that are made without."""
+        places = find(*of, "cpu", tmp_path)  # type: ignore[arg-type]
+        return all(np.array_equal(getattr(places, k).numpy(), getattr(begun, k).numpy()) for k in visibility.TYPES)
+
+    made.clear()
+    assert same(solids, (-2.0, 0.2), 30.0)
+    assert same(solids, (-2.0, 0.2), 30.0)
+    assert len(made) == 1
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    for content in (whole[:-4], pickle.dumps(whole)):
+        path.write_bytes(content)
+        assert same(solids, (-2.0, 0.2), 30.0)
+    assert len(made) == 3
+    assert path.read_bytes() == whole
+    moved = Solids(**{**vars(solids[0]), "top": solids[0].top + 0.01})
+    for other in ((solids, (-2.0, 0.3), 30.0), (solids, (-2.0, 0.2), 12.0), ([moved], (-2.0, 0.2), 30.0)):
+        find(*other, "cpu", tmp_path)
+    assert len(made) == 6
+    assert len(list(tmp_path.iterdir())) == 4

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from romnav.world.build import build
 from romnav.world.geodesic import UNIT, fields
 from romnav.world.spawns import LEVEL_GAP, Start, sample
 from romnav.world.spec import SamplerSpec, WorldSpec
-from romnav.world.world import MOUTH_RADIUS, World, build
+from romnav.world.world import MOUTH_RADIUS, World
 
 COUNT = 6000
 

@@ -1,15 +1,13 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from romnav.world import world as module
+from romnav.world.build import build
 from romnav.world.geodesic import fields
 from romnav.world.spec import WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 SPEC = WorldSpec(tiles=3, seed=31, goals_per_tile=5)
 
@@ -45,29 +43,3 @@ def test_outside_the_tile_is_occupied(world: World) -> None:
     xy = torch.tensor([[-0.01, 5.0], [SPEC.side, 5.0], [5.0, -3.0], [5.0, SPEC.side + 5.0]])
     zero = torch.zeros(4, dtype=torch.int64)
     assert (world.node_at(zero, zero, xy) == -1).all()
-
-
-def test_same_seed_same_world_other_seed_other_world(world: World) -> None:
-    again = build(SPEC)
-    assert torch.equal(world.node, again.node)
-    assert torch.equal(world.goal, again.goal)
-    assert torch.equal(world.fields, again.fields)
-    other = build(SPEC.model_copy(update={"seed": 32}))
-    assert not torch.equal(world.node, other.node)
-
-
-def test_cache_is_used_and_heals(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    build(SPEC, tmp_path)
-    (path,) = tmp_path.iterdir()
-    torn = path.read_bytes()[:1000]
-
-    def fail(*_: object) -> None:
-        raise AssertionError("generated although cached")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(module, "generate", fail)
-        assert torch.equal(build(SPEC, tmp_path).node, world.node)
-        with pytest.raises(AssertionError, match="although cached"):
-            build(SPEC.model_copy(update={"seed": 99}), tmp_path)
-    path.write_bytes(torn)
-    assert torch.equal(build(SPEC, tmp_path).node, world.node)

@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from romnav import files
@@ -36,7 +35,7 @@ def encoder(work: Workspace, sensor: str, settings: Scale | None = None) -> Stag
         record=folder / "encoder.json",
         settings=own,
         uses=("world", sensor, SENSORS[sensor]),
-        make=partial(_pretrain, own, sensor, work.worlds),
+        make=partial(_pretrain, work, own, sensor),
         scratch=("state.pt",),
     )
     if settings is None or stage.key == encoder(work, sensor).key:
@@ -46,14 +45,14 @@ def encoder(work: Workspace, sensor: str, settings: Scale | None = None) -> Stag
 
 
 def _pretrain(
-    settings: Scale, sensor: str, worlds: Path, stage: Stage, session: Session, progress: Progress
+    work: Workspace, settings: Scale, sensor: str, stage: Stage, session: Session, progress: Progress
 ) -> dict[str, Any]:
     from romnav.sensing.encoder import load
     from romnav.sensing.pretrain import pretrain
-    from romnav.world.world import build
+    from romnav.world.build import build
 
-    world = build(settings.world, worlds, progress)
-    scanner = make_sensor(settings, sensor, world.tiles, session.device)
+    world = build(settings.world, work.worlds, progress)
+    scanner = make_sensor(work, settings, sensor, world.tiles, session.device)
     path = pretrain(
         getattr(settings, SENSORS[sensor]),
         list(zip(world.tiles, world.grids, strict=True)),
@@ -78,17 +77,18 @@ def quality(work: Workspace, sensor: str) -> Stage:
         record=trained.folder / "held-out.json",
         settings=work.settings,
         uses=("quality",),
-        make=partial(_judge, work.settings, sensor),
+        make=partial(_judge, work, sensor),
         upstream=(trained,),
     )
 
 
-def _judge(settings: Scale, sensor: str, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+def _judge(work: Workspace, sensor: str, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
     from romnav.report.encoder_figure import draw_encoder
     from romnav.sensing.encoder import load_autoencoder
     from romnav.sensing.pretrain import quality
     from romnav.world.tiles import generate
 
+    settings = work.settings
     spec = settings.quality
     if spec.seed == settings.world.seed:
         raise RomnavError(f"quality.seed: {spec.seed} is the training terrain's; set another one in the scale")
@@ -97,7 +97,7 @@ def _judge(settings: Scale, sensor: str, stage: Stage, session: Session, progres
     for index in range(spec.tiles):
         tiles.append(generate(terrain, index))
         progress(index + 1, spec.tiles, "tiles")
-    scanner = make_sensor(settings, sensor, [tile for tile, _ in tiles], session.device)
+    scanner = make_sensor(work, settings, sensor, [tile for tile, _ in tiles], session.device)
     model = load_autoencoder(stage.upstream[0].folder / "encoder.pt", session.device)
     corruption = getattr(settings, SENSORS[sensor]).corruption
     judged = (model, tiles, scanner, scanner.spec.height, corruption)
@@ -107,12 +107,14 @@ def _judge(settings: Scale, sensor: str, stage: Stage, session: Session, progres
     return {}
 
 
-def make_sensor(settings: Scale, sensor: str, tiles: Sequence[Tile], device: str) -> Lidar | DepthCamera:
+def make_sensor(
+    work: Workspace, settings: Scale, sensor: str, tiles: Sequence[Tile], device: str
+) -> Lidar | DepthCamera:
     """A sensor of `SENSORS` among the solids of ``tiles``."""
     from romnav.sensing.depth import DepthCamera
     from romnav.sensing.lidar import Lidar
 
     solids = [tile.solids for tile in tiles]
     if sensor == "lidar":
-        return Lidar(solids, settings.lidar, device)
+        return Lidar(solids, settings.lidar, device, work.worlds)
     return DepthCamera(solids, settings.depth, device)

@@ -59,7 +59,7 @@ def _encoders(work: Workspace, settings: Scale) -> dict[str, Stage]:
 def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
     from romnav.navigation import checkpoint
     from romnav.navigation.train import train
-    from romnav.world.world import build
+    from romnav.world.build import build
 
     world, seed = build(settings.world, work.worlds, progress), stage.seed or 0
     path = train(
@@ -95,14 +95,21 @@ def perception(
     pretrained = _encoders(work, work.arm_settings(str(trained.arm)))
     noises = {"lidar": noise, "depth": noise + DEPTH_NOISE}
     eyes = {
-        sensor: _eye(settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
+        sensor: _eye(work, settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
         for sensor in ("lidar", *(pretrained.keys() - {"lidar"}))
     }
     return Perception(**eyes)
 
 
 def _eye(
-    settings: Scale, sensor: str, pretrained: Stage | None, seed: int, world: World, noise: int, device: str
+    work: Workspace,
+    settings: Scale,
+    sensor: str,
+    pretrained: Stage | None,
+    seed: int,
+    world: World,
+    noise: int,
+    device: str,
 ) -> Eye:
     """A sensor with its pretrained encoder, or the random one that the training with ``seed`` began with."""
     from romnav.navigation.perception import Eye
@@ -111,7 +118,7 @@ def _eye(
     from romnav.sensing.corruption import Corruption
 
     navigation, pretraining = settings.navigation, getattr(settings, SENSORS[sensor])
-    scanner = make_sensor(settings, sensor, world.tiles, device)
+    scanner = make_sensor(work, settings, sensor, world.tiles, device)
     if pretrained:
         made = encoders.load(pretrained.folder / "encoder.pt", pretraining.encoder, device)
     else:

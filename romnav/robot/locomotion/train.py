@@ -23,7 +23,7 @@ from romnav.robot.locomotion.task import LocomotionEnv, WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.spec import LocomotionSpec, PpoSpec
-from romnav.world.world import build
+from romnav.world.build import build
 
 GROUPS = {"actor": ["policy"], "critic": ["policy", "privileged"]}
 
@@ -198,7 +198,7 @@ def train(
         progress: told the iteration, their number, and reward per step and falls per second of a robot.
         threads: of the physics; 0 means all cores. They do not change the result.
         save_every: seconds between checkpoints.
-        worlds: cache of worlds, see `romnav.world.world.build`.
+        worlds: cache of worlds, see `romnav.world.build.build`.
 
     Returns:
         The checkpoint.

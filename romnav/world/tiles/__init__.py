@@ -1,5 +1,5 @@
 """Procedural generators of the tile classes (paper, Sec. IV-A, Environments)."""
 
-from romnav.world.tiles.generate import fault, generate, generate_counted
+from romnav.world.tiles.generate import fault, generate
 
-__all__ = ["fault", "generate", "generate_counted"]
+__all__ = ["fault", "generate"]

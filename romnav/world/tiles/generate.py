@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,12 +33,6 @@ def generate(spec: WorldSpec, index: int) -> tuple[Tile, Grids]:
     Raises:
         RomnavError: No draw passes (an impossible spec).
     """
-    tile, grids, _ = generate_counted(spec, index)
-    return tile, grids
-
-
-def generate_counted(spec: WorldSpec, index: int) -> tuple[Tile, Grids, int]:
-    """As `generate`, and the number of draws that it took."""
     kind = TileClass(spec.classes[index % len(spec.classes)])
     why = None
     for attempt in range(MAX_ATTEMPTS):
@@ -46,7 +41,7 @@ def generate_counted(spec: WorldSpec, index: int) -> tuple[Tile, Grids, int]:
         grids = rasterise(tile, spec.grid)
         why = fault(tile, grids)
         if why is None:
-            return tile, grids, attempt + 1
+            return replace(tile, draws=attempt + 1), grids
     raise RomnavError(
         f"world: no {kind} tile passed the reachability check in {MAX_ATTEMPTS} draws "
         f"(seed {spec.seed}, index {index}; {why}); widen world.side or steepen the riser and tread ranges"

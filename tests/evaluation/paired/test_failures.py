@@ -12,8 +12,9 @@ from romnav.evaluation.rollout import Oracle, Straight, View
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.evaluation.tracks import Recorder
 from romnav.navigation.spec import EnvSpec
+from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 
 SPEC = EpisodeSetSpec(
     world=WorldSpec(tiles=3, seed=53, goals_per_tile=16),

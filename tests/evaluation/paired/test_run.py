@@ -12,8 +12,9 @@ from romnav.evaluation.rollout import Oracle, Policy, Straight, View
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import EnvSpec, PolicySpec
+from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
-from romnav.world.world import World, build
+from romnav.world.world import World
 from tests.navigation.conftest import TOKENS, FakePerception
 
 SPEC = EpisodeSetSpec(

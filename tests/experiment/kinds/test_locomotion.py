@@ -15,9 +15,9 @@ from romnav.experiment.kinds.locomotion import body, gaits, locomotion
 from romnav.experiment.scales import Scale
 from romnav.robot.gaits import GaitLibrary
 from romnav.robot.humanoid import Humanoid
+from romnav.world.build import build
 from romnav.world.spawns import sample
 from romnav.world.spec import SamplerSpec
-from romnav.world.world import build
 from tests.experiment.conftest import workspace
 
 ARMS = """

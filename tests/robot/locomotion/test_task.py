@@ -16,8 +16,8 @@ from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import load_policy, train
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
+from romnav.world.build import build
 from romnav.world.spec import WorldSpec
-from romnav.world.world import build
 
 SHARES = {"flat": 0.5, "stairs": 0.5}
 SPEC = LocomotionSpec(

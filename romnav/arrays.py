@@ -1,0 +1,68 @@
+"""Arrays and facts in one file, in the format of safetensors: mapped, not read, and nothing in it is ever run."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from romnav import files
+
+NAMES = {
+    "BOOL": np.dtype(np.bool_),
+    **{f"{kind.upper()}{8 * size}": np.dtype(f"{kind}{size}") for kind in "iu" for size in (1, 2, 4, 8)},
+    "F32": np.dtype(np.float32),
+    "F64": np.dtype(np.float64),
+}
+"""Types of arrays by their names in a file."""
+ALIGNMENT = 64
+"""The first array begins at a multiple of this, bytes."""
+
+
+def save(path: Path, arrays: Mapping[str, NDArray], facts: Any) -> None:
+    """Writes arrays, and facts: whatever JSON can tell.
+
+    Raises:
+        RomnavError: The file cannot be written.
+    """
+    types = {dtype: name for name, dtype in NAMES.items()}
+    # widest elements first: so all of them lie aligned, without the gaps that the format forbids
+    order = sorted(arrays, key=lambda name: -arrays[name].itemsize)
+    header: dict[str, Any] = {"__metadata__": {"facts": json.dumps(facts)}}
+    end = 0
+    for name in order:
+        array = arrays[name]
+        begin, end = end, end + array.nbytes
+        header[name] = {"dtype": types[array.dtype], "shape": array.shape, "data_offsets": [begin, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-(8 + len(text)) % ALIGNMENT)
+    with files.atomic(path) as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for name in order:
+            file.write(np.ascontiguousarray(arrays[name]).data)
+
+
+def load(path: Path) -> tuple[dict[str, NDArray], Any] | None:
+    """The arrays and facts of a file, or None where it is missing, torn or another format.
+
+    Arrays are pages of the file, shared with other processes; who writes to one writes to a copy of its page.
+    """
+    try:
+        data = np.memmap(path, np.uint8, "c")
+        start = 8 + int.from_bytes(data[:8].tobytes(), "little")
+        header = json.loads(data[8:start].tobytes())
+        facts = json.loads(header.pop("__metadata__")["facts"])
+        arrays = {}
+        for name, entry in header.items():
+            dtype, shape, (begin, end) = NAMES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
+            if min(shape, default=0) < 0 or end - begin != math.prod(shape) * dtype.itemsize or start + end > len(data):
+                return None
+            arrays[name] = np.asarray(data[start + begin : start + end]).view(dtype).reshape(shape)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+    return arrays, facts
