@@ -8,7 +8,7 @@ import typer
 
 from romnav.cli.app import app, run
 from romnav.cli.options import DeviceJob, ExperimentArgument, Job, SeedOption, command, experiments
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 
 if TYPE_CHECKING:
     from romnav.experiment.graph.stage import Stage
@@ -63,11 +63,18 @@ def tables(
     from romnav.experiment.kinds import reports
 
     names = [name] if name else job.project.experiments
-    wanted = [stage for n in names for stage in reports(job.work, n, job.project.experiment(n).seeds)]
-    recorded = [r for r in wanted if any((s.folder / s.outputs[-1]).exists() for s in r.upstream)]
-    for stage in recorded or wanted:
-        job.draw([stage])
-        _print_tables(stage)
+    missing: list[NothingRecorded] = []
+    drawn = []
+    for stage in (s for n in names for s in reports(job.work, n, job.project.experiment(n).seeds)):
+        try:
+            job.draw([stage])
+        except NothingRecorded as error:
+            missing.append(error)
+        else:
+            drawn.append(stage)
+            _print_tables(stage)
+    if missing and not drawn:
+        raise missing[0]
 
 
 def _reports(work: Workspace, kind: str, name: str, seed: int | None) -> list[Stage]:

@@ -10,7 +10,7 @@ from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
-from romnav.navigation.spec import NavigationSpec
+from romnav.navigation.spec import KickstartSpec, NavigationSpec
 from romnav.robot.spec import LocomotionSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
@@ -33,6 +33,8 @@ class Scale(Config):
     """Judging the encoders."""
     navigation: NavigationSpec = NavigationSpec()
     """Task, policy and reinforcement learning."""
+    kickstart: KickstartSpec | None = None
+    """Teacher of the policy, and how it teaches; without one, PPO alone."""
     locomotion: LocomotionSpec = LocomotionSpec()
     """The humanoid, and the policy that walks it."""
     evaluation: EvaluationSpec = EvaluationSpec()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -66,6 +67,7 @@ class NavigationEnv(VecEnv):
         """Share of the training run that is done; sets the scheduled weights."""
         self._lookup = GeodesicLookup(world)
         self._privileged = PrivilegedObservation(world)
+        self._connector = torch.from_numpy(np.concatenate([grid.connector for grid in world.grids])).to(device)
         count = spec.envs
         self._env = torch.arange(count, device=device)
         self._episode = torch.zeros_like(self._env)
@@ -146,6 +148,12 @@ class NavigationEnv(VecEnv):
         )
         seen["critic"] = torch.cat([seen["state"], privileged], dim=1)
         return seen
+
+    def places(self) -> Tensor:
+        """(E, 2) bool: the goal is across levels; the robot is on a stair or ramp."""
+        d = self.dynamics
+        node = self.world.node_at(d.tile, d.layer, d.position[:, :2])
+        return torch.stack([self._cross, (node >= 0) & self._connector[node.clamp(min=0)]], dim=1)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
         """Drive all robots for one period; finished ones start anew before they are observed."""

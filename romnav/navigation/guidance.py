@@ -17,21 +17,16 @@ FAR = 0.5
 
 
 class Guidance:
-    """The loss where rsl-rl's PPO asks for that of a symmetry: an update adds it, weighted, to its own.
+    """The loss of the guesses, a term of an update's.
 
     A guess is a vector in the robot's frame, which the mean squared error makes as long as the guess is sure, and the
     logarithm of the way that is left.
     """
 
-    use_mirror_loss = True
-
     def __init__(self, coefficient: float) -> None:
-        self.mirror_loss_coeff = coefficient
+        self.coefficient = coefficient
 
-    def augment_batch(self, batch: RolloutStorage.Batch, size: int) -> None:
-        """Add nothing to the batch."""
-
-    def compute_loss(self, actor: MLPModel, batch: RolloutStorage.Batch, size: int) -> Tensor:
+    def loss(self, actor: MLPModel, batch: RolloutStorage.Batch) -> Tensor:
         """Mean loss of the guesses that ``actor`` made of the batch that it was just shown."""
         direction, log_geodesic = privileged_way(cast(Tensor, batch.observations["critic"]))
         guess = cast(NavigationActor, actor).guess

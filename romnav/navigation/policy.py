@@ -201,16 +201,25 @@ class NavigationActor(MLPModel):
         stochastic_output: bool = False,
     ) -> Tensor:
         """Actions (..., 3): samples or means. Products up to the last layer in `reduced_precision`; weights float32."""
+        parameters = self._raw(obs, masks, hidden_state)
+        if not stochastic_output:
+            return self.distribution.deterministic_output(parameters)
+        self.distribution.update(parameters)
+        return self.distribution.sample()
+
+    def beta(self, obs: TensorDict) -> Tensor:
+        """Beta parameters (B, 2, 3) of one step, in place of an action."""
+        self.distribution.update(self._raw(obs, None, None))
+        return torch.stack(self.distribution.params, dim=-2)
+
+    def _raw(self, obs: TensorDict, masks: Tensor | None, hidden_state: HiddenState) -> Tensor:
+        """What the distribution makes its parameters of, (..., 2, 3)."""
         with reduced_precision(obs["state"].device):
             latent = self.get_latent(obs, masks, hidden_state)
             features = self.mlp[1](self.mlp[0](latent))
         if self.way is not None and masks is not None:
             self.guess = self.way(latent.float())
-        parameters = self.mlp[3](self.mlp[2](features.float()))
-        if not stochastic_output:
-            return self.distribution.deterministic_output(parameters)
-        self.distribution.update(parameters)
-        return self.distribution.sample()
+        return self.mlp[3](self.mlp[2](features.float()))
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
         """``[h_t, visual, state]`` of one step (B, ...) or, with episode starts as ``masks``, a rollout (T, B, ...)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Generator
 from itertools import chain
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -74,10 +74,57 @@ class PrivilegedCritic(MLPModel):
         return last(features.float())
 
 
+class Term(Protocol):
+    """A term of the loss beside PPO's own."""
+
+    coefficient: float
+
+    def loss(self, actor: MLPModel, batch: RolloutStorage.Batch) -> Tensor:
+        """Its mean, unweighted, over the minibatch that ``actor`` was just shown."""
+        ...
+
+
+class Terms:
+    """Further terms of the loss by name, in the part of the symmetry that rsl-rl's `PPO.update` asks.
+
+    Attributes:
+        surrogate: Factor of PPO's own objective.
+    """
+
+    use_mirror_loss = True
+    mirror_loss_coeff = 1.0
+
+    def __init__(self, by_name: dict[str, Term]) -> None:
+        self.by_name = by_name
+        self.surrogate = 1.0
+        self._seen: dict[str, list[float]] = {}
+
+    def __len__(self) -> int:
+        return len(self.by_name)
+
+    def augment_batch(self, batch: RolloutStorage.Batch, size: int) -> None:
+        """Scale the objective, which is linear in the advantages."""
+        batch.advantages = batch.advantages * self.surrogate
+
+    def compute_loss(self, actor: MLPModel, batch: RolloutStorage.Batch, size: int) -> Tensor:
+        """Weighted sum of the terms."""
+        losses = {name: term.loss(actor, batch) for name, term in self.by_name.items()}
+        for name, loss in losses.items():
+            self._seen.setdefault(name, []).append(loss.item())
+        return torch.stack([self.by_name[name].coefficient * loss for name, loss in losses.items()]).sum()
+
+    def means(self) -> dict[str, float]:
+        """Means of the terms, unweighted, since they were last asked for."""
+        means = {name: sum(seen) / len(seen) for name, seen in self._seen.items()}
+        self._seen = {}
+        return means
+
+
 class BoundedPPO(PPO):
-    """PPO whose adaptive learning rate stays within bounds."""
+    """PPO whose adaptive learning rate stays within bounds, and whose loss may have further terms."""
 
     learning_rate_range = (0.0, float("inf"))
+    symmetry: Terms
     storage: RolloutStorage
 
     @property
@@ -93,7 +140,23 @@ class BoundedPPO(PPO):
     def update(self) -> dict[str, float]:
         """One update; its mean losses by name."""
         losses: dict[str, float] = super().update()
-        return {"guidance" if name == "symmetry" else name: value for name, value in losses.items()}
+        losses.pop("symmetry", None)
+        return losses | self.symmetry.means()
+
+    def begin(self, share: float) -> None:
+        """Set everything that is scheduled once ``share`` of the run is done."""
+
+    def report(self) -> dict[str, float]:
+        """Columns of the learning curve beside the losses."""
+        return {}
+
+    def memories(self) -> dict[str, HiddenState]:
+        """What the networks remember of the running episodes."""
+        return {"memory": self.actor.get_hidden_state()}
+
+    def remember(self, memories: dict[str, Any]) -> None:
+        """Restore `memories`."""
+        self.actor.reset(hidden_state=memories["memory"])
 
     def unfreeze(self, encoder: Encoder, obs: TensorDict) -> None:
         """Train a copy of ``encoder`` with the policy from the next rollout on; ``obs`` now holds images."""
@@ -105,13 +168,18 @@ class BoundedPPO(PPO):
         )
 
 
+P = TypeVar("P", bound=BoundedPPO)
+
+
 def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> NavigationActor:
     """Policy network for the observations ``obs``; one that is ``guided`` also guesses the way."""
     return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
-def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str) -> BoundedPPO:
-    """Actor, critic, rollout and optimiser."""
+def make_ppo(
+    obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str, kind: type[P] = BoundedPPO
+) -> P:
+    """Actor, critic, rollout and optimiser, of the ``kind`` of PPO."""
     actor = make_actor(obs, policy, guided=spec.guidance > 0.0).to(device)
     actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
     critic = PrivilegedCritic(
@@ -131,10 +199,9 @@ def make_ppo(obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, devi
         "desired_kl": spec.desired_kl,
         "learning_rate": spec.learning_rate,
     }
-    ppo = BoundedPPO(actor, critic, storage, device=device, **options)
+    ppo = kind(actor, critic, storage, device=device, **options)
     # one pass over all parameters instead of ten per tensor
     ppo.optimizer = torch.optim.Adam(chain(actor.parameters(), critic.parameters()), spec.learning_rate, fused=True)
     ppo.learning_rate_range = spec.learning_rate_range
-    if spec.guidance > 0.0:
-        ppo.symmetry = Guidance(spec.guidance)
+    ppo.symmetry = Terms({"guidance": Guidance(spec.guidance)} if spec.guidance > 0.0 else {})
     return ppo

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from romnav.config import Config
 from romnav.sensing.spec import CorruptionSpec
@@ -147,6 +147,51 @@ class PPOSpec(Config):
     threads: int = 1
     """PyTorch threads of the run (A: another number gives other bits; two runs on a thread each do half as much again
     as one run on two)."""
+
+
+class Schedule(Config):
+    """A number that changes linearly once over a run."""
+
+    start: float
+    """Before."""
+    end: float
+    """After."""
+    between: tuple[float, float] = (0.0, 1.0)
+    """Shares of the run at which the change begins and is done."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if not 0.0 <= self.between[0] < self.between[1] <= 1.0:
+            raise ValueError(f"between: {list(self.between)}; set two rising shares from 0 to 1")
+        return self
+
+    def __call__(self, share: float) -> float:
+        """Value once ``share`` of the run is done."""
+        low, high = self.between
+        return self.start + (self.end - self.start) * min(max((share - low) / (high - low), 0.0), 1.0)
+
+
+class KickstartSpec(Config):
+    """Training held to a teacher: L_PPO + lambda L_KL (paper, Sec. III-C)."""
+
+    teacher: str
+    """Arm whose policy is the teacher (P: the reduced-order model's)."""
+    direction: Literal["teacher-student", "student-teacher"] = "teacher-student"
+    """KL(teacher || student), or the other way round (A: the literature's; the paper writes KL(pi, pi_R), not saying
+    which it means)."""
+    weight: Schedule = Schedule(start=1.0, end=0.05, between=(0.05, 0.55))
+    """lambda (P: 1 until iteration 100 of 2000, 0.05 from 1100 on; A: linearly)."""
+    ppo: Schedule = Schedule(start=1.0, end=1.0)
+    """Factor of PPO's surrogate and entropy, not of the value loss; 0 is distillation alone (P: 1 throughout)."""
+    init: Literal["fresh", "teacher"] = "fresh"
+    """Weights that the student begins with: random ones, or the teacher's, with what it sees in addition not connected
+    yet (A: the paper names no warm start)."""
+    critic_first: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of the run in which only the critic learns (A: none; a critic that knows nothing spoils a policy that was
+    given something)."""
+    concentration: float | None = Field(default=None, gt=2.0)
+    """Upper bound on the sum of the teacher's two Beta parameters (A: none; a certain teacher leaves the student no
+    exploration)."""
 
 
 class NavigationSpec(Config):

@@ -17,9 +17,10 @@ from romnav import files
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
+from romnav.navigation.kickstart import KickstartedPPO, Teacher, blank_lesson
 from romnav.navigation.perception import Perception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
-from romnav.navigation.spec import NavigationSpec
+from romnav.navigation.spec import KickstartSpec, NavigationSpec
 from romnav.robot.dynamics import Body
 from romnav.robot.rom import ReducedOrderModel
 from romnav.threads import torch_threads
@@ -39,6 +40,7 @@ def train(
     seed: int,
     *,
     body: Body = ReducedOrderModel,
+    kickstart: tuple[KickstartSpec, Path] | None = None,
     device: str = "cpu",
     resume: bool = True,
     progress: Progress | None = None,
@@ -49,11 +51,24 @@ def train(
     ``out/checkpoint.pt`` holds the whole state of the run every two minutes: a run that is killed and started again
     ends in the same weights as one left alone. It is deleted at the end.
 
+    Args:
+        spec: Task, policy and learning.
+        world: Terrain.
+        perception: Sensors.
+        out: Folder of the results.
+        seed: Of weights and episodes.
+        body: Makes the robots.
+        kickstart: How to be taught, and the teacher's policy.
+        device: Torch device.
+        resume: Whether to go on from an earlier run.
+        progress: Told (steps done, steps in all, recent success).
+
     Raises:
-        RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written.
+        RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written; the teacher does not
+            fit.
     """
     with torch_threads(spec.ppo.threads):
-        return _train(spec, world, perception, out, seed, body, device, resume, progress)
+        return _train(spec, world, perception, out, seed, body, kickstart, device, resume, progress)
 
 
 def _train(
@@ -63,6 +78,7 @@ def _train(
     out: Path,
     seed: int,
     body: Body,
+    kickstart: tuple[KickstartSpec, Path] | None,
     device: str,
     resume: bool,
     progress: Progress | None,
@@ -73,10 +89,12 @@ def _train(
     perception.images = False
     env = NavigationEnv(world, dynamics, perception, spec.env, seed, device)
     obs = env.get_observations()
-    ppo = make_ppo(obs, spec.policy, spec.ppo, spec.env.envs, device)
+    ppo = _learner(spec, env, obs, perception, kickstart, device)
     identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
     if perception.depth is not None:
         identity["depth_encoder"] = perception.depth.encoder.digest()
+    if kickstart is not None and isinstance(ppo, KickstartedPPO):
+        identity |= {"kickstart": kickstart[0].model_dump_json(), "teacher": ppo.teacher.digest}
     total = spec.ppo.iterations * spec.ppo.stages
     unfreeze_at = round(spec.encoder.unfreeze_at * total)
     state = out / "checkpoint.pt"
@@ -97,6 +115,7 @@ def _train(
         if done == unfreeze_at:
             obs = _unfreeze(ppo, env, perception)
         env.progress = done / spec.ppo.iterations
+        ppo.begin(done / total)
         with torch.inference_mode():
             for _ in range(spec.ppo.steps):
                 obs, reward, dones, extras = env.step(ppo.act(obs))
@@ -111,7 +130,7 @@ def _train(
         done += 1
         seconds = before + time.monotonic() - started
         cpu_seconds = cpu_before + time.process_time() - cpu_started
-        curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate))
+        curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate) | ppo.report())
         _check_finite(state, done, curve[-1], ppo)
         if progress:
             progress(done * steps, total * steps, _summary(curve))
@@ -127,6 +146,24 @@ def _train(
     return policy
 
 
+def _learner(
+    spec: NavigationSpec,
+    env: NavigationEnv,
+    obs: TensorDict,
+    perception: Perception,
+    kickstart: tuple[KickstartSpec, Path] | None,
+    device: str,
+) -> BoundedPPO:
+    if kickstart is None:
+        return make_ppo(obs, spec.policy, spec.ppo, env.num_envs, device)
+    if spec.encoder.unfreeze_at < 1.0:
+        raise RomnavError("navigation.encoder.unfreeze_at: a teacher reads a frozen encoder's tokens; set it to 1.0")
+    teacher = Teacher(kickstart[1], perception, kickstart[0], device)
+    ppo = make_ppo(blank_lesson(obs), spec.policy, spec.ppo, env.num_envs, device, KickstartedPPO)
+    ppo.enrol(teacher, env.places)
+    return ppo
+
+
 def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:
     content = {**identity, "actor": ppo.actor.state_dict(), "steps": steps, "hours": seconds / 3600}
     checkpoint.save(path, content)
@@ -138,7 +175,7 @@ def _save(
     content = {
         **identity,
         **ppo.save(),
-        "memory": ppo.actor.get_hidden_state(),
+        **ppo.memories(),
         "env": env.state_dict(),
         "random": torch.get_rng_state(),
         "iterations": done,
@@ -166,7 +203,7 @@ def _restore(
                 f"{path}: belongs to a run with another {key}; delete it, or pass --no-resume to start over"
             )
     ppo.load(content, None, True)
-    ppo.actor.reset(hidden_state=content["memory"])
+    ppo.remember(content)
     env.load_state_dict(content["env"])
     torch.set_rng_state(content["random"].cpu())
 

@@ -32,9 +32,9 @@ def test_only_the_right_guess_costs_nothing() -> None:
     for guess, cost in (([0.6, 0.8, math.log(5.0)], 0.0), ([0.6, -0.8, math.log(5.0)], 2.56), ([0.0, 0.0, 0.0], None)):
         actor.guess = torch.tensor(guess).expand(3, 2, 3)
         expected = 1.0 + 0.25 * math.log(5.0) ** 2 if cost is None else cost
-        torch.testing.assert_close(loss.compute_loss(actor, batch([0.6, 0.8], 5.0), 3).item(), expected)
+        torch.testing.assert_close(loss.loss(actor, batch([0.6, 0.8], 5.0)).item(), expected)
     # at the goal there is no direction to guess
-    assert loss.compute_loss(actor, batch([0.6, 0.8], 0.3), 3).item() == 0.0
+    assert loss.loss(actor, batch([0.6, 0.8], 0.3)).item() == 0.0
 
 
 def test_guesses_get_better_and_stay_with_the_policy(

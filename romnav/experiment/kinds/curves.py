@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.policy import policy
@@ -55,7 +55,7 @@ def _draw(
             arms[arm] = curves.read(label, unfreeze_at, [run.folder / "curve.csv" for run in runs])
         commits |= {record.provenance["commit"][:12] for run in runs if (record := recorded[run.name])}
     if not arms:
-        raise RomnavError(f"{stage.folder}: no arm of {name} is trained; run `romnav run ablation {name}`")
+        raise NothingRecorded(f"{stage.folder}: no arm of {name} is trained; run `romnav run ablation {name}`")
     provenance = {"scale": work.scale, "commit": ", ".join(sorted(commits))}
     curves.draw(arms, stage.folder / stage.outputs[0])
     formats.write(curves.tabulate(name, experiment.title, arms, provenance), stage.folder / "tables")

@@ -5,10 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.encoder import SENSORS, encoder, make_sensor
 from romnav.experiment.kinds.locomotion import body, walking
 from romnav.experiment.scales import Scale
+from romnav.experiment.spec import suggest
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -21,7 +23,11 @@ DEPTH_NOISE = 1_000_003
 
 
 def policy(work: Workspace, arm: str, seed: int) -> Stage:
-    """The trained policy of an arm, or of the one whose policy it drives."""
+    """The trained policy of an arm, or of the one whose policy it drives; a teacher is trained with the same seed.
+
+    Raises:
+        RomnavError: The teacher is no trained arm, or taught itself.
+    """
     arm = work.project.driver(arm)
     settings = work.arm_settings(arm)
     folder = work.folder / arm / f"seed-{seed}"
@@ -31,6 +37,9 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         uses.append("pretrain.encoder")
     if "depth" in encoders:
         uses += ["depth", "pretrain_depth.corruption"]
+    teacher = [_teacher(work, arm, settings.kickstart.teacher, seed)] if settings.kickstart else []
+    if teacher:
+        uses.append("kickstart")
     return Stage(
         kind="policy",
         name=f"policy {arm}, seed {seed}",
@@ -40,12 +49,23 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         settings=settings,
         uses=tuple(uses),
         make=partial(_train, work, settings),
-        upstream=(*encoders.values(), *walking(work, settings)),
+        upstream=(*encoders.values(), *teacher, *walking(work, settings)),
         scratch=("checkpoint.pt", "curve.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
         arm=arm,
         seed=seed,
     )
+
+
+def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
+    project = work.project
+    key = f"{project.file(project.having(arm)[0])}: arms.{arm}.kickstart.teacher"
+    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if not spec.policy}
+    if teacher not in trained:
+        raise RomnavError(f"{key}: no arm {teacher} that is trained{suggest(teacher, trained)}")
+    if work.arm_settings(teacher).kickstart:
+        raise RomnavError(f"{key}: {teacher} has a teacher itself; name one that was trained by PPO alone")
+    return policy(work, teacher, seed)
 
 
 def _encoders(work: Workspace, settings: Scale) -> dict[str, Stage]:
@@ -62,6 +82,7 @@ def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, pro
     from romnav.world.build import build
 
     world, seed = build(settings.world, work.worlds, progress), stage.seed or 0
+    teachers = [above.folder / "policy.pt" for above in stage.upstream if above.kind == "policy"]
     path = train(
         settings.navigation,
         world,
@@ -69,6 +90,7 @@ def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, pro
         stage.folder,
         seed,
         body=body(work, settings, seed, session.device, settings.navigation.ppo.threads),
+        kickstart=None if settings.kickstart is None else (settings.kickstart, teachers[0]),
         device=session.device,
         resume=session.resume,
         progress=progress,

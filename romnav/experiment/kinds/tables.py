@@ -52,7 +52,10 @@ def _write(work: Workspace, names: Sequence[str], stage: Stage, session: Session
 
     bootstrap = Bootstrap(results.load(work.project.results, work.scale))
     specs = {spec.name: spec for spec in tables.SPECS}
-    for done, name in enumerate(names, 1):
-        formats.write(tables.build(specs[name], bootstrap), stage.folder)
-        progress(done, len(names), name)
+    built = []
+    for name in names:
+        built.append(tables.build(specs[name], bootstrap))
+        progress(len(built), len(names), name)
+    for table in built:  # all or none
+        formats.write(table, stage.folder)
     return {}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import romnav.world.scenes
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.spec import SCRIPTED, Experiment, TrialKind
@@ -97,7 +97,7 @@ def _report(
     files = [above.folder / above.outputs[0] for above in stage.upstream]
     runs = [rows.read(file) for file in files if file.exists()]
     if not runs:
-        raise RomnavError(f"{files[0]}: no trials yet; run `romnav run {kind}`")
+        raise NothingRecorded(f"{files[0]}: no trials yet; run `romnav run {kind}`")
     scenes = _scenes(kind)
     tabulate, draw = {
         "safety": (tables.safety, pictures.draw_safety),

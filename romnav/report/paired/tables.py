@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 from romnav.evaluation.paired.metrics import Level
 from romnav.evaluation.paired.rows import HORIZONS, Arm
 from romnav.evaluation.paired.statistics import Bootstrap
@@ -27,12 +27,19 @@ class Entry:
 
 @dataclass(frozen=True)
 class Column:
-    """A metric in a performance table; ``best`` picks the value in bold."""
+    """A metric of the episodes of a level, or a cost of training, in a performance table; ``best`` picks the value in
+    bold."""
 
     metric: str
     header: str
     decimals: int
     best: Callable[[list[float]], float] | None
+    level: Level = "all"
+
+    @property
+    def key(self) -> str:
+        """Its name in files, and among the paper's numbers."""
+        return self.metric if self.level == "all" else f"{self.metric}_{self.level}"
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,15 @@ _ROM_NAV = Entry("rom-nav", "RoM-Nav")
 _BOUNDS = (Entry("oracle", "Oracle", competes=False), Entry("straight", "Straight", competes=False))
 _RATES = (Column("sr_45", "SR@45 (%)", 1, max), Column("sr_120", "SR@120 (%)", 1, max))
 _TIME, _SPL = Column("t2g", "T2G (s)", 1, min), Column("spl", "SPL", 3, max)
+_COSTS = {"steps": 1e-6, "hours": 1.0}
+"""Costs of training, by what they are multiplied with."""
+_COST_COLUMNS = (Column("steps", "Steps (M)", 1, None), Column("hours", "Hours", 1, None))
+_FAILURES = tuple(
+    Column(metric, f"{name}, {level} (%)", 1, min, level)
+    for metric, name in (("falls", "Falls"), ("timeouts", "Timeouts"))
+    for level in ("same", "cross")
+)
+_ORACLE_HUM = Entry("oracle-hum", "Oracle (hum)", competes=False)
 _METRICS = (
     "SR@45 and SR@120 are success within 45 s (the training budget) and 120 s; T2G is the mean time to goal "
     "over successful episodes; SPL is success weighted by path length against the geodesic route."
@@ -104,16 +120,27 @@ SPECS: tuple[PerformanceSpec | LevelsSpec, ...] = (
     PerformanceSpec(
         "nav-perf",
         f"Navigation performance across training methods. {_METRICS} Bold marks the best humanoid arm per "
-        "column. *RoM (cyl) is evaluated on RoM dynamics.",
+        "column. Steps and hours are of an arm's own training: RoM-Nav needs those of RoM as well. *RoM (cyl) is "
+        "evaluated on RoM dynamics.",
         _ROM_NAV,
         ((_ROM_CYL,), (_SINGLE, _ROM_HUM, _ROM_NAV)),
-        (*_RATES, _TIME, _SPL),
+        (*_RATES, _TIME, _SPL, *_COST_COLUMNS),
+        (_ORACLE_HUM,),
     ),
     LevelsSpec(
         "nav-levels",
         f"Paired contrasts of success rate by same-level and cross-level goals. Positive favours RoM-Nav; {_DAGGER}",
         _ROM_NAV,
         (_ROM_HUM, _SINGLE),
+    ),
+    PerformanceSpec(
+        "nav-failures",
+        "How episodes of 120 s fail, by same-level and cross-level goals: the robot fell, or its time ran out. Bold "
+        "marks the best humanoid arm per column. *RoM (cyl), evaluated on RoM dynamics, cannot fall.",
+        _ROM_NAV,
+        ((_ROM_CYL,), (_SINGLE, _ROM_HUM, _ROM_NAV)),
+        _FAILURES,
+        (_ORACLE_HUM,),
     ),
 )
 """The tables of the paper's Sec. IV that are made of paired episodes."""
@@ -152,7 +179,7 @@ def build(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> Table:
     if isinstance(spec, PerformanceSpec):
         spans: tuple[tuple[str, int], ...] = ()
         header = ("Arm", *(column.header for column in spec.columns))
-        keys = tuple(column.metric for column in spec.columns)
+        keys = tuple(column.key for column in spec.columns)
         ours, published = _performance(spec, bootstrap)
     else:
         spans = tuple((f"{horizon} s", 2) for horizon in HORIZONS)
@@ -172,11 +199,14 @@ def _performance(spec: PerformanceSpec, bootstrap: Bootstrap) -> tuple[_Blocks, 
     def measured(arm: str, column: Column) -> Cell:
         if arm not in bootstrap.arms:
             return number(math.nan, column.decimals)
-        estimate = bootstrap.metric(arm, column.metric)
+        if (unit := _COSTS.get(column.metric)) is not None:
+            runs = [getattr(run.provenance, column.metric) for run in bootstrap.arms[arm].runs]
+            return number(unit * sum(runs) / len(runs), column.decimals)
+        estimate = bootstrap.metric(arm, column.metric, column.level)
         return number(estimate.value, column.decimals, lo=estimate.lo, hi=estimate.hi, n=estimate.n)
 
     def published(arm: str, column: Column) -> Cell:
-        return number(paper.PERFORMANCE[arm][column.metric], column.decimals)
+        return number(paper.PERFORMANCE[arm].get(column.key, math.nan), column.decimals)
 
     bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
     return _with_best(spec, (*spec.blocks, bounds), measured), _with_best(spec, spec.blocks, published)
@@ -228,7 +258,7 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     shown = [bootstrap.arms[e.arm] for e in spec.entries if e.arm in bootstrap.arms]
     runs = [run for arm in shown for run in arm.runs]
     if not runs:
-        raise RomnavError(f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first")
+        raise NothingRecorded(f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first")
     files = [run.provenance for run in runs]
     facts = sources(files)
     seeds = distinct(str(len(arm.runs)) for arm in shown if any(run.provenance.steps for run in arm.runs))

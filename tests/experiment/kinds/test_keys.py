@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from romnav.errors import RomnavError
+from romnav.experiment.graph.run import waves
 from romnav.experiment.graph.stage import Stage
 from romnav.experiment.kinds import reports, trials
 from romnav.experiment.kinds.encoder import encoder, quality
@@ -27,7 +28,7 @@ rows = 15
 
 
 def workspace(root: Path, scale: str = SCALE) -> Workspace:
-    (root / "experiments").mkdir(exist_ok=True)
+    (root / "experiments").mkdir(exist_ok=True, parents=True)
     shutil.copy(ROOT / "experiments" / "spawn-goal.toml", root / "experiments")
     return conftest.workspace(root, scale)
 
@@ -237,3 +238,47 @@ def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> No
     assert changed == {"locomotion", "gait library", "tables humanoid"} | walking
     with pytest.raises(RomnavError, match=r"arms\.walked\.policy: trials drive .*; name rom in its place"):
         trials.trials(here, "safety", "walked", 0)
+
+
+KICKSTART = """
+kind = "ablation"
+title = "taught"
+tables = ["nav-perf"]
+[arms.rom]
+label = "RoM"
+[arms.nav]
+label = "taught"
+navigation.dynamics = "g1"
+kickstart.teacher = "%s"
+kickstart.concentration = 20.0
+[arms.nav-hum]
+label = "driven"
+policy = "rom"
+navigation.dynamics = "g1"
+"""
+
+
+def test_a_teacher_is_upstream_of_its_student_with_the_same_seed(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % "rom")
+    taught = policy(here, "nav", 3)
+    assert policy(here, "rom", 3) in taught.upstream
+    assert taught.spec["kickstart"]["concentration"] == 20.0
+    assert "kickstart" not in policy(here, "rom", 3).spec
+    assert episodes(here, "nav", 3).upstream[-1] == taught
+    softer = workspace(tmp_path / "softer")
+    softer.project.file("kickstart").write_text(KICKSTART.replace("20.0", "10.0") % "rom")
+    assert policy(softer, "nav", 3).key != taught.key
+    assert policy(softer, "rom", 3).key == policy(here, "rom", 3).key
+    groups = waves([*taught.upstream, taught, episodes(here, "nav", 3)])
+    assert [stage.name for stage in groups[-2]] == ["policy nav, seed 3"]
+
+
+@pytest.mark.parametrize(
+    ("teacher", "match"), [("nav-hum", "no arm nav-hum"), ("oracle", "no arm oracle"), ("nav", "has a teacher itself")]
+)
+def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: str) -> None:
+    here = workspace(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % teacher)
+    with pytest.raises(RomnavError, match=f"arms.nav.kickstart.teacher: .*{match}"):
+        policy(here, "nav", 0)

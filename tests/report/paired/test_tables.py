@@ -90,7 +90,7 @@ def row(cells: list[list[str]], label: str, nth: int = 0) -> list[str]:
 
 
 def test_all_four_tables_are_built(built) -> None:
-    assert list(built) == ["spawngoal-perf-rom", "spawngoal-levels-rom", "nav-perf", "nav-levels"]
+    assert list(built) == ["spawngoal-perf-rom", "spawngoal-levels-rom", "nav-perf", "nav-levels", "nav-failures"]
 
 
 def test_performance_table(built, arms) -> None:
@@ -124,6 +124,22 @@ def test_bold_is_the_best_competing_arm_and_never_the_time_of_the_ablation(built
     assert not any(cell.bold for cell in cyl.rows[0].cells)
     times = [float(r.cells[2].text) for r in humanoid.rows]
     assert [r.cells[2].bold for r in humanoid.rows] == [t == min(times) for t in times]
+
+
+def test_failures_by_level_and_costs_of_training(built, arms) -> None:
+    cells = read_latex(formats.latex(built["nav-failures"]))
+    of = {arm.name: arm.runs[0].columns for arm in arms}
+    columns = of["rom-nav"]
+    expected = [
+        f"{100 * (columns['outcome'][columns['level'] == level] == outcome).mean():.1f}"
+        for outcome in ("fall", "timeout")
+        for level in ("same", "cross")
+    ]
+    assert [re.sub(r"\\textbf{(.*)}", r"\1", cell) for cell in row(cells, "RoM-Nav")] == expected
+    assert row(cells, "RoM-Nav", 1) == ["--", r"\textbf{8.3}", "--", r"\textbf{3.7}"]
+    perf = read_latex(formats.latex(built["nav-perf"]))
+    assert row(perf, "RoM-Nav")[-2:] == ["1.5", "0.2"]
+    assert row(perf, "RoM-Nav", 1)[-2:] == ["--", "32.0"]
 
 
 def test_ties_share_the_bold(episode_rows) -> None:
