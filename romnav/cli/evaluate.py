@@ -34,6 +34,15 @@ TERRAIN_COLUMNS = {
     "velocity_error": "error m/s",
     "yaw_error": "error rad/s",
 }
+NAVIGATION_COLUMNS = {
+    "driver": "driver",
+    "place": "place",
+    "episodes": "episodes",
+    "fell": "fell",
+    "falls_per_100m": "falls/100 m",
+    "sr_45": "SR@45",
+    "sr_120": "SR@120",
+}
 CONTRAST_COLUMNS = {
     "a": "a",
     "b": "b",
@@ -59,12 +68,18 @@ def evaluate(
     ],
     paired: Annotated[bool, typer.Option("--paired", help="Compare the arms episode by episode.")] = False,
     seed: SeedOption = None,
+    navigation: Annotated[
+        bool,
+        typer.Option("--navigation", help="Of locomotion: driven by the oracle and rom over the dev episodes."),
+    ] = False,
 ) -> None:
-    """Evaluate arms on the episode set that all arms share, or the locomotion policy on its terrain test."""
+    """Evaluate arms on the episode set that all arms share, or the locomotion policy on its tests."""
     from romnav.experiment.run import require_trained
 
+    if navigation and "locomotion" not in names:
+        raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
     if "locomotion" in names:
-        _evaluate_locomotion(job)
+        _evaluate_locomotion(job, navigation)
         names = [name for name in names if name != "locomotion"]
         if not names:
             return
@@ -96,13 +111,21 @@ def check(at: AtScale) -> None:
     typer.echo("\n".join(check(_collect(at), bands)))
 
 
-def _evaluate_locomotion(job: DeviceJob) -> None:
+def _evaluate_locomotion(job: DeviceJob, navigation: bool) -> None:
     from romnav.experiment import store
+    from romnav.experiment.run import require_trained
 
     terrain, walked = job.plan.terrain(), job.plan.locomotion()
     if not (walked.folder / "policy.pt").exists():
         train = f"romnav train locomotion --scale {job.scale}"
         raise RomnavError(f"{walked.folder}: no locomotion policy; train one with `{train}`")
+    if navigation:
+        test = job.plan.navigation()
+        require_trained([test])
+        job.make([test], {"navigation"})
+        rows = json.loads((test.folder / test.outputs[0]).read_text("utf-8"))
+        print_table("Locomotion under navigation, shares of episodes", rows, NAVIGATION_COLUMNS)
+        return
     job.make([terrain], {"terrain"})
     record = store.read(terrain)
     turning = record.facts["yaw_error"] if record else {}

@@ -87,7 +87,10 @@ class Plan:
     @property
     def episode_set(self) -> Path:
         """The initial conditions that all arms share."""
-        return self.project.root / "experiments" / "episodes" / f"{self.scale.settings.evaluation.episodes}.json"
+        return self._episodes(self.scale.settings.evaluation.episodes)
+
+    def _episodes(self, name: str) -> Path:
+        return self.project.root / "experiments" / "episodes" / f"{name}.json"
 
     def settings(self, arm: str) -> Scale:
         """The scale's settings with the changes of a trained arm.
@@ -148,6 +151,24 @@ class Plan:
     def terrain(self) -> Stage:
         """The fixed test of the locomotion policy."""
         return self._after_locomotion("terrain", "terrain test", "terrain.json")
+
+    def navigation(self) -> Stage:
+        """The test of the locomotion policy under navigation: the oracle and `rom` drive it over the `dev` episodes."""
+        walked, policy = self.locomotion(), self.policy("rom", 0)
+        settings = _on_body(cast(Scale, policy.settings), "g1")
+        return Stage(
+            kind="navigation",
+            name="navigation test",
+            folder=walked.folder,
+            outputs=("navigation.json",),
+            record=walked.folder / "navigation-record.json",
+            settings=settings,
+            uses=("navigation.env", "evaluation.duration", "evaluation.reach"),
+            reads=(self._episodes("dev"),),
+            upstream=(*self._walking(settings), *policy.upstream, policy),
+            arm=policy.arm,
+            seed=policy.seed,
+        )
 
     def gaits(self) -> Stage:
         """The gait library of the locomotion policy."""
@@ -218,12 +239,14 @@ class Plan:
         return self._driven("episodes", "episodes", "evaluation", (self.episode_set,), arm, seed)
 
     def trials(self, kind: TrialKind, arm: str, seed: int) -> Stage:
-        """The trials of a trained or scripted arm in scenes, with the safety filter off and on.
+        """The trials of a trained or scripted arm in scenes, with the safety filter off and on: on the humanoid if it
+        walks on that, otherwise on the reduced-order model with a body.
 
         Raises:
-            RomnavError: The arm is another one on another body; trials have a body of their own.
+            RomnavError: The arm drives the policy of another one on the same body.
         """
-        if (driver := self.project.driver(arm)) != arm:
+        driver = self.project.driver(arm)
+        if driver != arm and self.settings(arm).navigation.dynamics == "rom":
             raise RomnavError(
                 f"{self.project.file(self.project.having(arm)[0])}: arms.{arm}.policy: trials drive the "
                 f"reduced-order model with a body; name {driver} in its place"
@@ -244,10 +267,9 @@ class Plan:
             settings = cast(Scale, policy.settings)
             upstream = (*policy.upstream, policy)
         if driver != arm:
-            body = {"dynamics": self.settings(arm).navigation.dynamics}
-            settings = settings.model_copy(update={"navigation": settings.navigation.model_copy(update=body)})
+            settings = _on_body(settings, self.settings(arm).navigation.dynamics)
             uses = (*dict.fromkeys((*uses, "navigation.dynamics")),)
-        if kind == "episodes":
+        if settings.navigation.dynamics == "g1":
             present = {stage.name for stage in upstream}
             upstream = (*(stage for stage in self._walking(settings) if stage.name not in present), *upstream)
         folder = self.folder / arm / f"seed-{seed}"
@@ -326,12 +348,17 @@ class Plan:
             kind="report",
             name=f"report {name}",
             folder=self.folder,
-            outputs=(*(f"tables/{kind}.{format}" for format in ("tex", "md", "csv")), f"figures/{kind}.png"),
+            outputs=(*(f"tables/{name}.{format}" for format in ("tex", "md", "csv")), f"figures/{name}.png"),
             record=self.folder / "tables" / f"{name}.json",
             settings=experiment,
             uses=("labels",),
             upstream=tuple(self.trials(kind, arm, seed) for arm, seed in arms),
         )
+
+
+def _on_body(settings: Scale, dynamics: str) -> Scale:
+    navigation = settings.navigation.model_copy(update={"dynamics": dynamics})
+    return settings.model_copy(update={"navigation": navigation})
 
 
 def digest(path: Path) -> str:

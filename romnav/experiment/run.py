@@ -18,7 +18,7 @@ Action = Callable[[Stage, Progress], dict[str, Any]]
 
 
 EVERYTHING = (
-    *("encoder", "quality", "locomotion", "terrain", "gaits", "policy"),
+    *("encoder", "quality", "locomotion", "terrain", "gaits", "policy", "navigation"),
     *("episodes", "trials", "tables", "curves", "report"),
 )
 """Kinds of stages."""
@@ -77,7 +77,7 @@ def require_walking(stages: Collection[Stage]) -> None:
     missing = {stage.name: stage for stage in stages if stage.kind == "locomotion"}
     for stage in stages:
         for walked in stage.upstream:
-            if stage.kind in ("policy", "episodes") and walked.name in missing:
+            if stage.kind in ("policy", "episodes", "trials", "navigation") and walked.name in missing:
                 changed = "; ".join(store.differences(walked))
                 reason = f"was trained with other settings ({changed})" if changed else "is not trained to the end"
                 raise RomnavError(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from romnav.evaluation.rowfile import Provenance
     from romnav.navigation.perception import Eye, Perception
     from romnav.robot.dynamics import Body
+    from romnav.robot.humanoid import Humanoid
     from romnav.sensing.depth import DepthCamera
     from romnav.sensing.lidar import Lidar
     from romnav.world.scenes.scene import Scene
@@ -79,6 +80,7 @@ class Stages:
             "quality": self.quality,
             "locomotion": self.locomotion,
             "terrain": self.terrain,
+            "navigation": self.navigation,
             "gaits": self.gaits,
             "policy": self.policy,
             "episodes": self.episodes,
@@ -157,6 +159,22 @@ class Stages:
         files.write(stage.folder / "terrain.json", json.dumps(rows, indent=2) + "\n")
         return {"yaw_error": turning}
 
+    def navigation(self, stage: Stage, progress: Progress) -> dict[str, Any]:
+        """Counts the falls of the locomotion policy under navigation by place."""
+        from romnav.evaluation import episodes, rollout
+        from romnav.evaluation.paired import falls
+
+        settings = cast(Scale, stage.settings)
+        spec, (path,) = settings.evaluation, stage.reads
+        dev = episodes.load(path)
+        world = episodes.terrain(dev, path, self._worlds)
+        body = self._body(stage, spec.threads)
+        rows: list[dict[str, Any]] = []
+        for name, driver in (("oracle", rollout.SCRIPTED["oracle"]()), (str(stage.arm), self._driver(stage, world))):
+            rows += falls.count(name, driver, world, dev, settings.navigation.env, spec, body, progress)
+        files.write(stage.folder / stage.outputs[0], json.dumps(rows, indent=2) + "\n")
+        return {}
+
     def gaits(self, stage: Stage, progress: Progress) -> dict[str, Any]:
         """Records the gait library of the locomotion policy."""
         from romnav.robot.gaits import record, still_up
@@ -229,7 +247,17 @@ class Stages:
         scenes = _scenes(kind)
         world = scene_world(scenes).to(self.device)
         spec = getattr(settings, kind)
-        columns = trials.run(self._driver(stage, world), scenes, world, settings.navigation.env, spec, progress)
+        walks = settings.navigation.dynamics == "g1"
+        columns = trials.run(
+            self._driver(stage, world),
+            scenes,
+            world,
+            settings.navigation.env,
+            spec,
+            progress,
+            body=self._humanoid(stage, spec.threads) if walks else None,
+            arms=settings.locomotion.robot if walks else None,
+        )
         starts = trials.draw(scenes, world, spec).digest
         rows = trial_rows.TrialRows(str(stage.arm), stage.seed or 0, columns, self._provenance(stage, starts))
         trial_rows.write(stage.folder / stage.outputs[0], rows)
@@ -279,30 +307,34 @@ class Stages:
         from romnav.report.trials import pictures as trial_pictures
         from romnav.report.trials import tables as trial_tables
 
-        experiment = cast(Experiment, stage.settings)
+        experiment, name = cast(Experiment, stage.settings), Path(stage.outputs[0]).stem
         files = [above.folder / above.outputs[0] for above in stage.upstream]
         runs = [trial_rows.read(file) for file in files if file.exists()]
         if not runs:
-            raise RomnavError(f"{files[0]}: no trials yet; run `romnav run {experiment.kind}`")
+            raise RomnavError(f"{files[0]}: no trials yet; run `romnav run {' '.join({experiment.kind: 0, name: 0})}`")
         scenes = _scenes(experiment.kind)
         build, draw = {
             "safety": (trial_tables.safety, trial_pictures.draw_safety),
             "deploy": (trial_tables.deploy, trial_pictures.draw_deployments),
         }[experiment.kind]
-        formats.write(build(runs, scenes, experiment.labels), stage.folder / "tables")
+        table = replace(build(runs, scenes, experiment.labels), name=name)
+        formats.write(table, stage.folder / "tables")
         draw(runs[0], scenes, stage.folder / stage.outputs[-1])
         return {}
 
     def _body(self, stage: Stage, threads: int) -> Body:
-        """What makes the robots of a stage.
-
-        Raises:
-            RomnavError: The humanoid is to walk on another device than the CPU.
-        """
+        """What makes the robots of a stage."""
         from romnav.robot.rom import ReducedOrderModel
 
-        if cast(Scale, stage.settings).navigation.dynamics == "rom":
-            return ReducedOrderModel
+        walks = cast(Scale, stage.settings).navigation.dynamics == "g1"
+        return self._humanoid(stage, threads) if walks else ReducedOrderModel
+
+    def _humanoid(self, stage: Stage, threads: int) -> Callable[[World, int, float], Humanoid]:
+        """What makes humanoids that walk by the stage's locomotion policy.
+
+        Raises:
+            RomnavError: They are to walk on another device than the CPU.
+        """
         if self.device != "cpu":
             raise RomnavError(f"{stage.name}: the humanoid has no physics engine on {self.device} here; use cpu")
         from romnav.robot.gaits import GaitLibrary

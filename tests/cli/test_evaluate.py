@@ -20,6 +20,15 @@ def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> Non
     assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no locomotion policy; train one with")
 
 
+def test_the_navigation_test_is_of_a_trained_locomotion_policy_and_rom(project: Path) -> None:
+    assert fails("eval", "rom", "--navigation").startswith("--navigation: a test of the locomotion policy")
+    folder = project / "results" / "smoke" / "locomotion"
+    assert fails("eval", "locomotion", "--navigation").startswith(f"{folder}: no locomotion policy; train one")
+    folder.mkdir(parents=True)
+    (folder / "policy.pt").touch()
+    assert "policy rom, seed 0 is not trained" in fails("eval", "locomotion", "--navigation")
+
+
 def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
     assert "policy rom, seed 0 is not trained; run `romnav train policy rom`" in fails("eval", "rom")
 

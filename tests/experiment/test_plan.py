@@ -223,8 +223,6 @@ def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> No
     changed = {name.removesuffix(", seed 0") for name in before if before[name] != after[name]}
     walking = {"episodes walked", "episodes guided", "episodes own", "policy own"}
     assert changed == {"locomotion", "gait library", "tables humanoid"} | walking
-    with pytest.raises(RomnavError, match=r"arms\.walked\.policy: trials drive .*; name rom in its place"):
-        here.trials("safety", "walked", 0)
 
 
 KICKSTART = """
@@ -267,3 +265,25 @@ def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: 
     here.project.file("kickstart").write_text(KICKSTART % teacher)
     with pytest.raises(RomnavError, match=f"arms.nav.kickstart.teacher: .*{match}"):
         here.policy("nav", 0)
+
+
+def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:
+    here = plan(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % "rom")
+    for arm in ("nav", "nav-hum"):
+        trial = here.trials("safety", arm, 0)
+        assert {"locomotion", "gait library"} <= {stage.name for stage in trial.upstream}
+        assert trial.settings.navigation.dynamics == "g1"  # type: ignore[attr-defined]
+    assert "locomotion" not in everything(here.trials("safety", "rom", 0))
+    here.project.file("kickstart").write_text(KICKSTART.replace('"rom"\nnavigation.dynamics = "g1"', '"rom"') % "rom")
+    again = plan(tmp_path)
+    with pytest.raises(RomnavError, match="name rom in its place"):
+        again.trials("safety", "nav-hum", 0)
+
+
+def test_the_navigation_test_drives_the_rom_on_the_dev_episodes(tmp_path: Path) -> None:
+    test = plan(tmp_path).navigation()
+    assert test.upstream[-1] == plan(tmp_path).policy("rom", 0)
+    assert {"locomotion", "gait library"} <= {stage.name for stage in test.upstream}
+    assert [path.name for path in test.reads] == ["dev.json"]
+    assert test.outputs == ("navigation.json",)
