@@ -69,10 +69,6 @@ class Stages:
     resume: bool = True
 
     @property
-    def _worlds(self) -> Path:
-        return self.plan.project.root / ".cache" / "worlds"
-
-    @property
     def actions(self) -> Mapping[str, Action]:
         """What makes the output of each kind of stage."""
         return {
@@ -146,7 +142,7 @@ class Stages:
             device=self.device,
             resume=self.resume,
             progress=progress,
-            worlds=self._worlds,
+            worlds=self.plan.project.worlds,
         )
         return training_cost(path)
 
@@ -216,7 +212,7 @@ class Stages:
 
         settings = cast(Scale, stage.settings)
         paired = episodes.load(self.plan.episode_set)
-        world = episodes.terrain(paired, self.plan.episode_set, self._worlds).to(self.device)
+        world = episodes.terrain(paired, self.plan.episode_set, self.plan.project.worlds).to(self.device)
         driver = self._driver(stage, world)
         spec = settings.evaluation
         body = self._body(stage, spec.threads)
@@ -390,7 +386,7 @@ class Stages:
         """Terrain, from the cache if it was built before."""
         from romnav.world.build import build
 
-        return build(spec, self._worlds, progress)
+        return build(spec, self.plan.project.worlds, progress)
 
     def _perception(self, policy: Stage, settings: Scale, world: World, noise: int) -> Perception:
         """What a policy sees; through a depth camera, too, if its training had one."""
@@ -432,5 +428,5 @@ class Stages:
 
         solids = [tile.solids for tile in tiles]
         if sensor == "lidar":
-            return Lidar(solids, settings.lidar, self.device, self._worlds)
+            return Lidar(solids, settings.lidar, self.device, self.plan.project.worlds)
         return DepthCamera(solids, settings.depth, self.device)
