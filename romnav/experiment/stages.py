@@ -163,7 +163,7 @@ class Stages:
         settings = cast(Scale, stage.settings)
         spec, (path,) = settings.evaluation, stage.reads
         dev = episodes.load(path)
-        world = episodes.terrain(dev, path, self._worlds)
+        world = episodes.terrain(dev, path, self.plan.project.worlds)
         body = self._body(stage, spec.threads)
         rows: list[dict[str, Any]] = []
         for name, driver in (("oracle", rollout.SCRIPTED["oracle"]()), (str(stage.arm), self._driver(stage, world))):

@@ -113,9 +113,7 @@ def test_a_foot_kicks_an_obstacle_but_not_the_ground_that_it_walks_on(obstacle: 
     stand(free, 0.793)
     toes = free.ankle[0, 0] + torch.tensor([SOLE[0] + FOOT_LENGTH / 2, 0.0, 0.0])
     builder, deep, layers = SolidsBuilder(), 0.004, (-1, -1) if obstacle else (0, 0)
-    builder.box(
-        (float(toes[0]) - deep + 0.5, float(toes[1])), (1.0, 0.15), (0.0, 0.08), layers=(-1, -1) if obstacle else (0, 0)
-    )
+    builder.box((float(toes[0]) - deep + 0.5, float(toes[1])), (1.0, 0.15), (0.0, 0.08), layers=layers)
     robots = Humanoids(RobotSpec(), TileGeoms(builder.build(), 2, 0), 1, threads=1)
     stand(robots, 0.793)
     for _ in range(3):
