@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from romnav import files
-from romnav.experiment import store
+from romnav.experiment.graph import records
 
 ROOT = Path(__file__).parents[1]
 CORES = os.cpu_count() or 1
@@ -76,7 +76,7 @@ def report(
     medians = {peer: statistics.median(values) for peer, values in peers.items()}
     own = statistics.median(ours)
     ratios = {peer: own / m if larger_is_better else m / own for peer, m in medians.items()}
-    source = store.provenance()
+    source = records.provenance()
     rows = [("romnav", own, ours, ""), *((p, m, peers[p], f"{ratios[p]:.2f}") for p, m in medians.items())]
     table = [
         [label, f"{median:.4g}", f"{min(values):.4g} to {max(values):.4g}", ratio]

@@ -14,7 +14,7 @@ import torch
 from _common import arguments, markdown, take_turns
 
 from romnav import files
-from romnav.experiment import store
+from romnav.experiment.graph import records
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import untrained
@@ -77,7 +77,7 @@ def main() -> None:
             }
             rate, learned, share = (record[name][k] for k in list(record[name]) if k != "ms_per_batch")
             rows.append([name, f"{rate:,}", f"{learned:,}", f"{share:.0%}"])
-    source = store.provenance()
+    source = records.provenance()
     text = f"Pretraining, one thread, CPU time, batches of {PretrainSpec().batch}. {source['machine']}.\n\n"
     text += markdown(["", "images made per s", "images learned from per s", "share of making them"], rows)
     print(text, flush=True)

@@ -17,7 +17,7 @@ from _common import CORES, arguments, in_children, markdown
 from _learner import load_world, ours, scale
 
 from romnav import files
-from romnav.experiment import store
+from romnav.experiment.graph import records
 from romnav.world.geodesic import GeodesicLookup
 
 ENVS = (64, 128, 256, 512, 1024, 2048, 4096)
@@ -62,7 +62,7 @@ def main() -> None:
     """Measure, print and write ``results/bench/scaling.json``."""
     options = arguments(__doc__, repeats=3)
     default = scale()
-    source = store.provenance()
+    source = records.provenance()
     rows: dict[str, list[dict[str, float]]] = {"envs": [], "tiles": []}
     load_world(default.world)
     for envs in ENVS:

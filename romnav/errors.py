@@ -1,4 +1,4 @@
-"""The one exception a user's mistake raises."""
+"""What a user's mistake raises."""
 
 from __future__ import annotations
 
@@ -8,3 +8,7 @@ class RomnavError(Exception):
 
     The command line prints the message without a traceback and exits with status 1.
     """
+
+
+class NothingRecorded(RomnavError):
+    """A report that there is nothing yet to make of."""

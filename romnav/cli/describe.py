@@ -39,9 +39,9 @@ def world(
     from romnav.report.difficulty_figure import draw_difficulty
 
     with bar("world") as progress:
-        described = describe_world(at.plan, experiment, progress)
+        described = describe_world(at.work, experiment, progress)
     told = described.plain()
-    path = out or at.plan.folder / "figures" / f"describe-{experiment}.png"
+    path = out or at.work.folder / "figures" / f"describe-{experiment}.png"
     draw_difficulty(described.difficulty.goals, path)
     if as_json:
         typer.echo(json.dumps(told, indent=2))

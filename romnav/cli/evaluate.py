@@ -74,18 +74,22 @@ def evaluate(
     ] = False,
 ) -> None:
     """Evaluate arms on the episode set that all arms share, or the locomotion policy on its tests."""
-    from romnav.experiment.run import require_trained
+    from romnav.experiment.graph.run import require
+    from romnav.experiment.kinds.episodes import episodes
 
     if navigation and "locomotion" not in names:
         raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
     if "locomotion" in names:
-        _evaluate_locomotion(job, navigation)
+        (_test_navigation if navigation else _test_terrain)(job)
         names = [name for name in names if name != "locomotion"]
         if not names:
             return
-    stages = [job.plan.episodes(n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
-    require_trained(stages)
-    job.make(stages, {"episodes"})
+    stages = [episodes(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+    for stage in stages:
+        driver = job.project.driver(str(stage.arm))
+        for policy in (above for above in stage.upstream if (above.kind, above.arm) == ("policy", driver)):
+            require(policy, stage)
+    job.make(stages)
     _print_results(_collect(job), names, paired)
 
 
@@ -107,37 +111,38 @@ def check(at: AtScale) -> None:
     from romnav.experiment.bands import check
 
     # bands belong to the project: --results is where the results of today lie
-    bands = at.project.root / "results" / at.plan.scale.name / "bands.json"
+    bands = at.project.root / "results" / at.work.scale / "bands.json"
     typer.echo("\n".join(check(_collect(at), bands)))
 
 
-def _evaluate_locomotion(job: DeviceJob, navigation: bool) -> None:
-    from romnav.experiment import store
-    from romnav.experiment.run import require_trained
+def _test_terrain(job: DeviceJob) -> None:
+    from romnav.experiment.graph import records
+    from romnav.experiment.kinds.locomotion import terrain
 
-    terrain, walked = job.plan.terrain(), job.plan.locomotion()
-    if not (walked.folder / "policy.pt").exists():
-        train = f"romnav train locomotion --scale {job.scale}"
-        raise RomnavError(f"{walked.folder}: no locomotion policy; train one with `{train}`")
-    if navigation:
-        test = job.plan.navigation()
-        require_trained([test])
-        job.make([test], {"navigation"})
-        rows = json.loads((test.folder / test.outputs[0]).read_text("utf-8"))
-        print_table("Locomotion under navigation, shares of episodes", rows, NAVIGATION_COLUMNS)
-        return
-    job.make([terrain], {"terrain"})
-    record = store.read(terrain)
+    test = terrain(job.work)
+    job.make([test])
+    record = records.read(test)
     turning = record.facts["yaw_error"] if record else {}
-    rows = json.loads((terrain.folder / terrain.outputs[0]).read_text("utf-8"))
+    rows = json.loads((test.folder / test.outputs[0]).read_text("utf-8"))
     rows = [row | {"yaw_error": turning.get(row["terrain"])} for row in rows]
     print_table("Locomotion, shares of trials", rows, TERRAIN_COLUMNS)
+
+
+def _test_navigation(job: DeviceJob) -> None:
+    from romnav.experiment.graph.run import require
+    from romnav.experiment.kinds.navigation import navigation
+
+    test = navigation(job.work)
+    require(test.upstream[-1], test)
+    job.make([test])
+    rows = json.loads((test.folder / test.outputs[0]).read_text("utf-8"))
+    print_table("Locomotion under navigation, shares of episodes", rows, NAVIGATION_COLUMNS)
 
 
 def _collect(at: AtScale) -> dict[str, Any]:
     from romnav.report.paired.results import collect
 
-    return collect(at.project.results, at.plan.scale.name)
+    return collect(at.project.results, at.work.scale)
 
 
 def _print_results(collected: dict[str, Any], arms: list[str], contrasts: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 import typer
 
 if TYPE_CHECKING:
-    from romnav.experiment.plan import Plan, Stage
+    from romnav.experiment.graph.stage import Session, Stage
     from romnav.experiment.project import Project
+    from romnav.experiment.workspace import Workspace
 
 Function = TypeVar("Function", bound=Callable[..., None])
+
+
+def _say(line: str) -> None:
+    typer.echo(line, err=True)
 
 
 def scales() -> list[str]:
@@ -74,12 +79,11 @@ class AtScale(InProject):
     scale: ScaleOption = "smoke"
 
     @cached_property
-    def plan(self) -> Plan:
-        """The stages of the scale."""
-        from romnav.experiment.plan import Plan
-        from romnav.experiment.scales import ScaleFile
+    def work(self) -> Workspace:
+        """Where the stages of the scale lie, and with which settings."""
+        from romnav.experiment.workspace import Workspace
 
-        return Plan(self.project, ScaleFile(self.project.root / "experiments" / "scales", self.scale))
+        return Workspace(self.project, self.scale)
 
 
 @dataclass(frozen=True)
@@ -95,28 +99,33 @@ class Job(AtScale):
         """Where their numbers are computed."""
         return "cpu"
 
-    def make(self, targets: list[Stage], kinds: Collection[str]) -> None:
-        """Runs what the targets need; without ``resume``, stages of the given ``kinds`` start over."""
-        self.perform(self.pending(targets, kinds))
+    def make(
+        self, targets: Sequence[Stage], again: Sequence[Stage] | None = None, *, side_by_side: bool = False
+    ) -> None:
+        """Runs what the targets need; without ``resume``, those in ``again`` start over (default: the targets).
 
-    def pending(self, targets: list[Stage], kinds: Collection[str]) -> list[Stage]:
-        """What `make` would run, in order."""
-        from romnav.experiment.run import pending, require_walking
+        On the CPU, stages that have a command of their own can run ``side_by_side``.
+        """
+        from romnav.experiment.graph import launch, run
 
-        stages = pending(targets, () if self.resume else kinds)
-        require_walking(stages)
+        session = self._session()
+        repeated = () if self.resume else targets if again is None else again
+        stages = run.pending(targets, repeated)
         if not stages:
-            typer.echo("nothing to do: everything is finished and up to date", err=True)
-        return stages
+            _say("nothing to do: everything is finished and up to date")
+        execute = launch.execute_side_by_side if side_by_side and self.device == "cpu" else run.execute
+        execute(stages, session, _say)
 
-    def perform(self, stages: list[Stage]) -> None:
-        """Runs stages, one after the other."""
-        from romnav.experiment.run import execute
-        from romnav.experiment.stages import Stages, require_device
+    def draw(self, reports: Sequence[Stage]) -> None:
+        """Writes the reports that are out of date, or all without ``resume``, from what is recorded."""
+        from romnav.experiment.graph import records, run
 
-        require_device(self.device)
-        actions = Stages(self.plan, self.device, self.resume).actions
-        execute(stages, actions, self.resume, lambda line: typer.echo(line, err=True))
+        run.execute([r for r in reports if not self.resume or not records.finished(r)], self._session(), _say)
+
+    def _session(self) -> Session:
+        from romnav.experiment.graph.stage import Session
+
+        return Session(self.device, self.resume)
 
 
 @dataclass(frozen=True)

@@ -22,17 +22,18 @@ def world(
     from romnav.report.pictures import draw_tile
     from romnav.world.tiles import generate
 
-    path = out or at.plan.folder / "figures" / f"world-{seed}-{tile}.png"
-    draw_tile(*generate(at.plan.scale.settings.world.model_copy(update={"seed": seed}), tile), path)
+    path = out or at.work.folder / "figures" / f"world-{seed}-{tile}.png"
+    draw_tile(*generate(at.work.settings.world.model_copy(update={"seed": seed}), tile), path)
     typer.echo(path)
 
 
 @command(play, "locomotion")
-def locomotion(at: AtScale) -> None:
+def play_locomotion(at: AtScale) -> None:
     """Draw how the locomotion policy walks each terrain, and its training curve."""
+    from romnav.experiment.kinds.locomotion import locomotion
     from romnav.robot.locomotion.play import curve, strip
 
-    walked, figures = at.plan.locomotion().folder, at.plan.folder / "figures"
+    walked, figures = locomotion(at.work).folder, at.work.folder / "figures"
     for path in strip(walked / "policy.pt", figures):
         typer.echo(path)
     typer.echo(curve(walked / "curve.csv", figures / "locomotion-curve.png"))

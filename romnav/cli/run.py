@@ -8,26 +8,20 @@ import typer
 
 from romnav.cli.app import app, run
 from romnav.cli.options import DeviceJob, ExperimentArgument, Job, SeedOption, command, experiments
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 
 if TYPE_CHECKING:
-    from romnav.experiment.plan import Plan, Stage
+    from romnav.experiment.graph.stage import Stage
+    from romnav.experiment.workspace import Workspace
 
 
 @command(run, "ablation")
 def ablation(job: DeviceJob, name: ExperimentArgument, seed: SeedOption = None) -> None:
     """Train every arm of an ablation, evaluate them if it has tables of episodes, then write and print its tables."""
-    from romnav.experiment.launch import stages_side_by_side
-    from romnav.experiment.run import EVERYTHING
+    from romnav.experiment.graph.run import with_all_above
 
-    reports = _reports(job.plan, "ablation", name, seed)
-    stages = job.pending(reports, EVERYTHING)
-    if job.device == "cpu":
-        job.perform([stage for stage in stages if stage.kind in ("encoder", "gaits")])
-        for kind in ("policy", "episodes"):
-            stages_side_by_side(job.plan, [stage for stage in stages if stage.kind == kind], job.resume)
-        stages = [stage for stage in stages if stage in reports]
-    job.perform(stages)
+    reports = _reports(job.work, "ablation", name, seed)
+    job.make(reports, with_all_above(reports), side_by_side=True)
     for report in reports:
         _print_tables(report)
 
@@ -46,13 +40,13 @@ def _register_trials(kind: str, purpose: str) -> None:
     ) -> None:
         from romnav.experiment.spec import suggest
 
-        (report,) = _reports(job.plan, kind, name, seed)
+        (report,) = _reports(job.work, kind, name, seed)
         known = {str(stage.arm) for stage in report.upstream}
         for one in arm or ():
             if one not in known:
                 raise RomnavError(f"{job.project.file(name)}: no arm {one}{suggest(one, known)}")
-        job.make([stage for stage in report.upstream if not arm or stage.arm in arm], {"trials"})
-        job.perform([report])
+        job.make([stage for stage in report.upstream if not arm or stage.arm in arm])
+        job.draw([report])
         _print_tables(report)
 
 
@@ -66,23 +60,34 @@ def tables(
     name: Annotated[str | None, typer.Argument(help="Experiment; default: all.", autocompletion=experiments)] = None,
 ) -> None:
     """Write tables and figures again from what is recorded; nothing is trained or evaluated."""
-    known = job.project.experiments
-    reports = [s for n in ([name] if name else known) for s in job.plan.reports(n, job.project.experiment(n).seeds)]
-    recorded = [r for r in reports if any((s.folder / s.outputs[-1]).exists() for s in r.upstream)]
-    for stage in recorded or reports:
-        job.perform([stage])
-        _print_tables(stage)
+    from romnav.experiment.kinds import reports
+
+    names = [name] if name else job.project.experiments
+    missing: list[NothingRecorded] = []
+    drawn = []
+    for stage in (s for n in names for s in reports(job.work, n, job.project.experiment(n).seeds)):
+        try:
+            job.draw([stage])
+        except NothingRecorded as error:
+            missing.append(error)
+        else:
+            drawn.append(stage)
+            _print_tables(stage)
+    if missing and not drawn:
+        raise missing[0]
 
 
-def _reports(plan: Plan, kind: str, name: str, seed: int | None) -> list[Stage]:
+def _reports(work: Workspace, kind: str, name: str, seed: int | None) -> list[Stage]:
     """The reports of an experiment, which has to be of a kind; over all of its training seeds or one."""
-    experiment = plan.project.experiment(name)
+    from romnav.experiment.kinds import reports
+
+    experiment = work.project.experiment(name)
     if experiment.kind != kind:
         raise RomnavError(
-            f"{plan.project.file(name)}: key kind is {experiment.kind}, not {kind}; "
+            f"{work.project.file(name)}: key kind is {experiment.kind}, not {kind}; "
             f"run `romnav run {experiment.kind} {name}`"
         )
-    return plan.reports(name, experiment.seeds if seed is None else (seed,))
+    return reports(work, name, experiment.seeds if seed is None else (seed,))
 
 
 def _print_tables(stage: Stage) -> None:

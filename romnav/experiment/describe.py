@@ -7,8 +7,8 @@ from typing import Any
 
 from romnav.errors import RomnavError
 from romnav.evaluation.difficulty import Difficulty, measure, tally
-from romnav.experiment.plan import Plan
 from romnav.experiment.scales import Scale
+from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec
@@ -32,7 +32,7 @@ class Description:
         }
 
 
-def describe_world(plan: Plan, experiment: str, progress: Progress | None = None) -> Description:
+def describe_world(work: Workspace, experiment: str, progress: Progress | None = None) -> Description:
     """Builds the training terrain of an experiment and measures it with every sampler that differs, by arm.
 
     Raises:
@@ -40,17 +40,17 @@ def describe_world(plan: Plan, experiment: str, progress: Progress | None = None
     """
     samplers: dict[str, SamplerSpec] = {}
     shared: Scale | None = None
-    for arm in plan.project.experiment(experiment).arms:
-        settings = plan.settings(arm)
+    for arm in work.project.experiment(experiment).arms:
+        settings = work.arm_settings(arm)
         shared = shared or settings
         if settings.world != shared.world:
             raise RomnavError(
-                f"{plan.project.file(experiment)}: arms.{arm}.world differs from the first arm's; "
+                f"{work.project.file(experiment)}: arms.{arm}.world differs from the first arm's; "
                 "describe an experiment whose arms share one world"
             )
         if settings.navigation.env.sampler not in samplers.values():
             samplers[arm] = settings.navigation.env.sampler
     if shared is None:
-        raise RomnavError(f"{plan.project.file(experiment)}: key arms is empty")
-    world = build(shared.world, plan.project.worlds, progress)
+        raise RomnavError(f"{work.project.file(experiment)}: key arms is empty")
+    world = build(shared.world, work.project.worlds, progress)
     return Description(measure(world, samplers, shared.navigation.env, shared.evaluation), tally(world))

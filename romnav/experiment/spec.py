@@ -16,8 +16,8 @@ from romnav.errors import RomnavError
 
 SCRIPTED = ("oracle", "straight")
 """Arms that need no training; every ablation is evaluated beside them."""
-RESERVED = {*SCRIPTED, "encoder", "locomotion", "tables", "figures"}
-"""Names of other folders beside those of the arms."""
+RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
+"""Names of other folders beside those of the arms: figures, and one for a kind of stage."""
 
 BODY = {"dynamics"}
 """What an arm may change of the navigation section that drives the policy of another arm."""

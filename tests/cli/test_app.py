@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from romnav.experiment import run
+from romnav.experiment.graph import run
 from tests.cli.conftest import ROOT, edit, fails, romnav
 
 HEAVY = {"torch", "warp", "mujoco", "pandas", "pyarrow", "scipy", "matplotlib", "pydantic"}

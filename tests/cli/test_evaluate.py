@@ -15,22 +15,21 @@ from tests.cli.conftest import fails, romnav
 def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> None:
     folder = project / "results" / "smoke" / "locomotion"
     assert fails("eval", "locomotion") == (
-        f"{folder}: no locomotion policy; train one with `romnav train locomotion --scale smoke`"
+        f"{folder}: locomotion is missing, and terrain test needs it; run `romnav train locomotion --scale smoke`"
     )
     assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no locomotion policy; train one with")
 
 
-def test_the_navigation_test_is_of_a_trained_locomotion_policy_and_rom(project: Path) -> None:
+def test_the_navigation_test_is_of_the_locomotion_policy_and_needs_rom(project: Path) -> None:
     assert fails("eval", "rom", "--navigation").startswith("--navigation: a test of the locomotion policy")
-    folder = project / "results" / "smoke" / "locomotion"
-    assert fails("eval", "locomotion", "--navigation").startswith(f"{folder}: no locomotion policy; train one")
-    folder.mkdir(parents=True)
-    (folder / "policy.pt").touch()
-    assert "policy rom, seed 0 is not trained" in fails("eval", "locomotion", "--navigation")
+    message = fails("eval", "locomotion", "--navigation")
+    assert "policy rom, seed 0 is missing, and navigation test needs it" in message
 
 
 def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
-    assert "policy rom, seed 0 is not trained; run `romnav train policy rom`" in fails("eval", "rom")
+    message = fails("eval", "rom")
+    assert "policy rom, seed 0 is missing, and episodes rom, seed 0 needs it" in message
+    assert message.endswith("run `romnav train policy rom --seed 0 --scale smoke`")
 
 
 def test_results_are_printed_for_people_and_for_scripts(evaluated: Path) -> None:

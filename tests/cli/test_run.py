@@ -10,7 +10,7 @@ import pytest
 
 from romnav.evaluation.paired import rows
 from romnav.evaluation.trials import rows as trial_rows
-from romnav.experiment import launch, stages
+from romnav.experiment.graph import launch
 from tests.cli.conftest import edit, fails, romnav
 
 
@@ -59,14 +59,16 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     """The command, the plan and the records are real; the parts are quick stand-ins."""
     ran: list[str] = []
 
-    def write(self: Any, stage: Any, progress: Any) -> dict[str, Any]:
+    def write(*arguments: Any) -> dict[str, Any]:
+        *_, stage, _, progress = arguments
         ran.append(stage.name)
         for name in stage.outputs:
             (stage.folder / name).write_text(stage.key)
         progress(1, 1, "done")
         return {"steps": 1, "hours": 0.1}
 
-    def evaluate(self: Any, stage: Any, progress: Any) -> dict[str, Any]:
+    def evaluate(*arguments: Any) -> dict[str, Any]:
+        *_, stage, _, _ = arguments
         ran.append(stage.name)
         rows.write(stage.folder / "episodes.parquet", episode_rows(stage.arm, 0.7))
         return {}
@@ -79,9 +81,9 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
 
     said: list[str] = []
     monkeypatch.setattr(launch, "side_by_side", in_this_process)
-    monkeypatch.setattr(stages.Stages, "encoder", write)
-    monkeypatch.setattr(stages.Stages, "policy", write)
-    monkeypatch.setattr(stages.Stages, "episodes", evaluate)
+    monkeypatch.setattr("romnav.experiment.kinds.encoder._pretrain", write)
+    monkeypatch.setattr("romnav.experiment.kinds.policy._train", write)
+    monkeypatch.setattr("romnav.experiment.kinds.episodes._evaluate", evaluate)
     command = ("run", "ablation", "spawn-goal")
     result = romnav(*command)
     assert result.exit_code == 0, result.output
@@ -99,7 +101,7 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     )
     assert romnav(*command).exit_code == 0
     assert ran == ["policy nocap, seed 0", "episodes nocap, seed 0"]
-    assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.99 -> 0.9)" in line for line in said)
+    assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.995 -> 0.9)" in line for line in said)
     ran.clear()
     assert romnav("train", "policy", "rom", "--no-resume").exit_code == 0
     assert ran == ["policy rom, seed 0"]
@@ -110,13 +112,15 @@ def test_learning_curves_need_training_alone(project: Path, monkeypatch: pytest.
     """Fifteen runs, no evaluation; figure and table come again from what the runs recorded."""
     ran: list[str] = []
 
-    def encoder(self: Any, stage: Any, progress: Any) -> dict[str, Any]:
+    def encoder(*arguments: Any) -> dict[str, Any]:
+        *_, stage, _, _ = arguments
         ran.append(stage.name)
         for name in stage.outputs:
             (stage.folder / name).write_text(stage.key)
         return {}
 
-    def policy(self: Any, stage: Any, progress: Any) -> dict[str, Any]:
+    def policy(*arguments: Any) -> dict[str, Any]:
+        *_, stage, _, _ = arguments
         ran.append(stage.name)
         (stage.folder / "policy.pt").write_text("weights")
         count = stage.settings.navigation.ppo.iterations
@@ -130,8 +134,8 @@ def test_learning_curves_need_training_alone(project: Path, monkeypatch: pytest.
             assert result.exit_code == 0, result.output
 
     monkeypatch.setattr(launch, "side_by_side", in_this_process)
-    monkeypatch.setattr(stages.Stages, "encoder", encoder)
-    monkeypatch.setattr(stages.Stages, "policy", policy)
+    monkeypatch.setattr("romnav.experiment.kinds.encoder._pretrain", encoder)
+    monkeypatch.setattr("romnav.experiment.kinds.policy._train", policy)
     assert "no arm of pretrain is trained; run `romnav run ablation pretrain`" in romnav("tables", "pretrain").stderr
     result = romnav("run", "ablation", "pretrain")
     assert result.exit_code == 0, result.output

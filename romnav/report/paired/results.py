@@ -7,7 +7,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 from romnav.evaluation.paired import metrics, rows
 from romnav.evaluation.paired.statistics import Bootstrap
 
@@ -23,7 +23,9 @@ def load(results_dir: Path, scale: str) -> list[rows.Arm]:
     folder = results_dir / scale
     files = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
     if not files:
-        raise RomnavError(f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`")
+        raise NothingRecorded(
+            f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`"
+        )
     return rows.pair(_read_in_place(file, scale) for file in files)
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 from romnav.evaluation.paired.metrics import Level
 from romnav.evaluation.paired.rows import HORIZONS, Arm
 from romnav.evaluation.paired.statistics import Bootstrap
@@ -284,7 +284,7 @@ def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tup
     shown = [bootstrap.arms[e.arm] for e in spec.entries if e.arm in bootstrap.arms]
     runs = [run for arm in shown for run in arm.runs]
     if not runs:
-        raise RomnavError(f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first")
+        raise NothingRecorded(f"table {spec.name}: no arm of it was evaluated; evaluate {spec.reference.arm} first")
     files = [run.provenance for run in runs]
     facts = sources(files)
     seeds = distinct(str(len(arm.runs)) for arm in shown if any(run.provenance.steps for run in arm.runs))

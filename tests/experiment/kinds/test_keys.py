@@ -1,3 +1,5 @@
+"""Which stage needs which, and on which settings its output depends."""
+
 from __future__ import annotations
 
 import shutil
@@ -6,11 +8,18 @@ from pathlib import Path
 import pytest
 
 from romnav.errors import RomnavError
-from romnav.experiment.plan import Plan, Stage
+from romnav.experiment.graph.run import waves
+from romnav.experiment.graph.stage import Stage
+from romnav.experiment.kinds import reports, trials
+from romnav.experiment.kinds.encoder import encoder, quality
+from romnav.experiment.kinds.episodes import episodes
+from romnav.experiment.kinds.navigation import navigation
+from romnav.experiment.kinds.policy import policy
 from romnav.experiment.project import Project
-from romnav.experiment.scales import ScaleFile
+from romnav.experiment.workspace import Workspace
+from tests.experiment import conftest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SCALE = """
 [world]
 tiles = 4
@@ -19,12 +28,16 @@ rows = 15
 """
 
 
-def plan(root: Path, scale: str = SCALE) -> Plan:
-    folder = root / "experiments" / "scales"
-    folder.mkdir(parents=True, exist_ok=True)
+def workspace(root: Path, scale: str = SCALE) -> Workspace:
+    (root / "experiments").mkdir(exist_ok=True, parents=True)
     shutil.copy(ROOT / "experiments" / "spawn-goal.toml", root / "experiments")
-    (folder / "tiny.toml").write_text(scale)
-    return Plan(Project(root, root / "results"), ScaleFile(folder, "tiny"))
+    return conftest.workspace(root, scale)
+
+
+def report(work: Workspace, name: str, seeds: list[int]) -> Stage:
+    """The only report of an experiment."""
+    (stage,) = reports(work, name, seeds)
+    return stage
 
 
 def everything(tables: Stage) -> dict[str, str]:
@@ -56,11 +69,11 @@ TABLES = {"tables spawn-goal"}
 def test_a_setting_reruns_exactly_what_depends_on_it(
     tmp_path: Path, section: str, change: str, rerun: set[str]
 ) -> None:
-    before = everything(plan(tmp_path).tables("spawn-goal", [0]))
+    before = everything(report(workspace(tmp_path), "spawn-goal", [0]))
     name = change.split(" = ")[0]
     kept = "\n".join(line for line in SCALE.splitlines() if not line.startswith(name))
     kept = kept.replace(f"[{section}]", "") if name in SCALE else kept
-    after = everything(plan(tmp_path, f"{kept}\n[{section}]\n{change}\n").tables("spawn-goal", [0]))
+    after = everything(report(workspace(tmp_path, f"{kept}\n[{section}]\n{change}\n"), "spawn-goal", [0]))
     assert before.keys() == after.keys()
     assert {name for name in before if before[name] != after[name]} == rerun
 
@@ -80,7 +93,8 @@ def test_trials_are_repeated_where_filter_scenes_or_policy_changed(
 ) -> None:
     shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
     before, after = (
-        everything(plan(tmp_path, SCALE + more).reports("safety", [0])[0]) for more in ("", f"[{section}]\n{change}\n")
+        everything(reports(workspace(tmp_path, SCALE + more), "safety", [0])[0])
+        for more in ("", f"[{section}]\n{change}\n")
     )
     changed = {name.removesuffix(", seed 0") for name in before if before[name] != after[name]}
     assert changed == rerun | ({"report safety"} if rerun else set())
@@ -88,49 +102,49 @@ def test_trials_are_repeated_where_filter_scenes_or_policy_changed(
 
 def test_trials_are_out_of_date_when_a_scene_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
-    here = plan(tmp_path)
-    trials = here.trials("deploy", "oracle", 0)
-    assert {path.name for path in trials.reads} >= {"scene.py", "obstacles.py", "deployments.py"}
+    here = workspace(tmp_path)
+    driven = trials.trials(here, "deploy", "oracle", 0)
+    assert {path.name for path in driven.reads} >= {"scene.py", "obstacles.py", "deployments.py"}
     (tmp_path / "scene.py").write_text("another scene")
-    monkeypatch.setattr("romnav.experiment.plan.SCENES", (tmp_path / "scene.py",))
-    assert here.trials("deploy", "oracle", 0).key != trials.key
+    monkeypatch.setattr("romnav.experiment.kinds.trials.SCENES", (tmp_path / "scene.py",))
+    assert trials.trials(here, "deploy", "oracle", 0).key != driven.key
 
 
 def test_arms_share_the_settings_of_trials(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("more").write_text('kind = "safety"\ntitle = "t"\n[arms.own]\nlabel = "Own"\nsafety.trials = 3\n')
     with pytest.raises(RomnavError, match=r"arms\.own\.safety: set it in the scale"):
-        here.trials("safety", "own", 0)
+        trials.trials(here, "safety", "own", 0)
 
 
 def test_the_arms_share_one_encoder(tmp_path: Path) -> None:
-    keys = everything(plan(tmp_path).tables("spawn-goal", [0]))
+    keys = everything(report(workspace(tmp_path), "spawn-goal", [0]))
     assert len(keys) == 1 + 4 + 4 + 2 + 1
     assert len({keys[name] for name in TRAINED}) == 4
 
 
 def test_an_arm_that_changes_the_encoder_gets_its_own(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("more").write_text(
         'kind = "ablation"\ntitle = "t"\ntables = []\n[arms.fine]\nlabel = "Fine"\nlidar.rows = 30\n'
     )
-    own = here.policy("fine", 0).upstream[0]
-    assert own.folder != here.policy("rom", 0).upstream[0].folder
-    assert own.folder.parent == here.encoder().folder.parent
+    own = policy(here, "fine", 0).upstream[0]
+    assert own.folder != policy(here, "rom", 0).upstream[0].folder
+    assert own.folder.parent == encoder(here, "lidar").folder.parent
 
 
 def test_an_arm_without_pretraining_needs_no_encoder(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     arm = 'kind = "ablation"\ntitle = "t"\ntables = []\n[arms.own]\nlabel = "Own"\n'
     arm += "navigation.encoder.pretrained = false\n"
     here.project.file("more").write_text(arm)
-    own = here.policy("own", 0)
+    own = policy(here, "own", 0)
     assert own.upstream == ()
-    wider = Plan(Project(tmp_path, tmp_path / "results"), here.scale)
+    wider = Workspace(Project(tmp_path, tmp_path / "results"), "tiny")
     wider.project.file("more").write_text(arm + "pretrain.encoder.latent = 16\npretrain.epochs = 3\n")
-    assert wider.policy("own", 0).key != own.key
+    assert policy(wider, "own", 0).key != own.key
     wider.project.file("more").write_text(arm + "pretrain.epochs = 3\n")
-    assert Plan(Project(tmp_path, tmp_path / "results"), here.scale).policy("own", 0).key == own.key
+    assert policy(Workspace(Project(tmp_path, tmp_path / "results"), "tiny"), "own", 0).key == own.key
 
 
 @pytest.mark.parametrize(
@@ -146,30 +160,30 @@ def test_an_encoder_is_judged_apart_from_its_training(
     tmp_path: Path, section: str, change: str, rerun: set[str]
 ) -> None:
     def keys(scale: str) -> dict[str, str]:
-        here = plan(tmp_path, scale)
-        return everything(here.quality("lidar")) | everything(here.quality("depth"))
+        here = workspace(tmp_path, scale)
+        return everything(quality(here, "lidar")) | everything(quality(here, "depth"))
 
     before, after = keys(SCALE), keys(f"{SCALE}[{section}]\n{change}\n")
     assert {name for name in before if before[name] != after[name]} == rerun
 
 
 def test_seeds_are_trained_apart_and_share_the_scripted_arms(tmp_path: Path) -> None:
-    names = everything(plan(tmp_path).tables("spawn-goal", [0, 1])).keys()
+    names = everything(report(workspace(tmp_path), "spawn-goal", [0, 1])).keys()
     assert {"policy rom, seed 0", "policy rom, seed 1"} <= names
     assert "episodes oracle, seed 1" not in names
 
 
 def test_unknown_names_are_one_clear_error(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     with pytest.raises(RomnavError, match="unknown experiment spawn-gaol; did you mean spawn-goal"):
-        here.tables("spawn-gaol", [0])
+        report(here, "spawn-gaol", [0])
     with pytest.raises(RomnavError, match="unknown arm unifrom; did you mean uniform"):
-        here.episodes("unifrom", 0)
+        episodes(here, "unifrom", 0)
     text = here.project.file("spawn-goal").read_text()
     here.project.file("spawn-goal").write_text(text.replace("spawngoal-perf-rom", "spawngoal-prf-rom"))
-    fresh = Plan(Project(tmp_path, tmp_path / "results"), here.scale)
+    fresh = Workspace(Project(tmp_path, tmp_path / "results"), "tiny")
     with pytest.raises(RomnavError, match="unknown table spawngoal-prf-rom; did you mean spawngoal-perf-rom"):
-        fresh.tables("spawn-goal", [0])
+        report(fresh, "spawn-goal", [0])
 
 
 HUMANOID = """
@@ -191,13 +205,13 @@ navigation.dynamics = "g1"
 
 
 def test_a_policy_drives_another_body_without_being_trained_again(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("humanoid").write_text(HUMANOID)
-    walked, own = here.episodes("walked", 3), here.episodes("own", 0)
+    walked, own = episodes(here, "walked", 3), episodes(here, "own", 0)
     assert [stage.name for stage in walked.upstream] == [
         "locomotion", "gait library", "encoder lidar", "policy rom, seed 3"
     ]  # fmt: skip
-    assert walked.upstream[-1] == here.policy("rom", 3)
+    assert walked.upstream[-1] == policy(here, "rom", 3)
     assert walked.settings.navigation.dynamics == "g1"  # type: ignore[attr-defined]
     assert {stage.name for stage in own.upstream} == {
         "locomotion",
@@ -206,18 +220,18 @@ def test_a_policy_drives_another_body_without_being_trained_again(tmp_path: Path
         "encoder depth",
         "policy own, seed 0",
     }
-    assert "locomotion" in everything(here.policy("own", 0))
-    assert "locomotion" not in everything(here.episodes("rom", 3))
-    assert [stage.name for stage in here.episodes("guided", 3).upstream] == ["locomotion", "gait library"]
-    assert here.episodes("guided", 3).folder == here.episodes("guided", 0).folder
-    assert here.episodes("guided", 0).key != here.episodes("oracle", 0).key
+    assert "locomotion" in everything(policy(here, "own", 0))
+    assert "locomotion" not in everything(episodes(here, "rom", 3))
+    assert [stage.name for stage in episodes(here, "guided", 3).upstream] == ["locomotion", "gait library"]
+    assert episodes(here, "guided", 3).folder == episodes(here, "guided", 0).folder
+    assert episodes(here, "guided", 0).key != episodes(here, "oracle", 0).key
 
 
 def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("humanoid").write_text(HUMANOID)
     before, after = (
-        everything(Plan(here.project, plan(tmp_path, SCALE + more).scale).tables("humanoid", [0]))
+        everything(report(workspace(tmp_path, SCALE + more), "humanoid", [0]))
         for more in ("", "[locomotion]\niterations = 9\n")
     )
     changed = {name.removesuffix(", seed 0") for name in before if before[name] != after[name]}
@@ -244,46 +258,51 @@ navigation.dynamics = "g1"
 
 
 def test_a_teacher_is_upstream_of_its_student_with_the_same_seed(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("kickstart").write_text(KICKSTART % "rom")
-    taught = here.policy("nav", 3)
-    assert here.policy("rom", 3) in taught.upstream
+    taught = policy(here, "nav", 3)
+    assert policy(here, "rom", 3) in taught.upstream
     assert taught.spec["kickstart"]["concentration"] == 20.0
-    assert "kickstart" not in here.policy("rom", 3).spec
-    assert here.episodes("nav", 3).upstream[-1] == taught
-    softer = plan(tmp_path / "softer")
+    assert "kickstart" not in policy(here, "rom", 3).spec
+    assert episodes(here, "nav", 3).upstream[-1] == taught
+    softer = workspace(tmp_path / "softer")
     softer.project.file("kickstart").write_text(KICKSTART.replace("20.0", "10.0") % "rom")
-    assert softer.policy("nav", 3).key != taught.key
-    assert softer.policy("rom", 3).key == here.policy("rom", 3).key
+    assert policy(softer, "nav", 3).key != taught.key
+    assert policy(softer, "rom", 3).key == policy(here, "rom", 3).key
+    groups = waves([*taught.upstream, taught, episodes(here, "nav", 3)])
+    assert [stage.name for stage in groups[-2]] == ["policy nav, seed 3"]
 
 
 @pytest.mark.parametrize(
     ("teacher", "match"), [("nav-hum", "no arm nav-hum"), ("oracle", "no arm oracle"), ("nav", "has a teacher itself")]
 )
 def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: str) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("kickstart").write_text(KICKSTART % teacher)
     with pytest.raises(RomnavError, match=f"arms.nav.kickstart.teacher: .*{match}"):
-        here.policy("nav", 0)
+        policy(here, "nav", 0)
 
 
 def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:
-    here = plan(tmp_path)
+    here = workspace(tmp_path)
     here.project.file("kickstart").write_text(KICKSTART % "rom")
     for arm in ("nav", "nav-hum"):
-        trial = here.trials("safety", arm, 0)
+        trial = trials.trials(here, "safety", arm, 0)
         assert {"locomotion", "gait library"} <= {stage.name for stage in trial.upstream}
         assert trial.settings.navigation.dynamics == "g1"  # type: ignore[attr-defined]
-    assert "locomotion" not in everything(here.trials("safety", "rom", 0))
-    here.project.file("kickstart").write_text(KICKSTART.replace('"rom"\nnavigation.dynamics = "g1"', '"rom"') % "rom")
-    again = plan(tmp_path)
+    assert "locomotion" not in everything(trials.trials(here, "safety", "rom", 0))
+    again = workspace(tmp_path / "again")
+    same_body = KICKSTART.replace('"rom"\nnavigation.dynamics = "g1"', '"rom"')
+    again.project.file("kickstart").write_text(same_body % "rom")
     with pytest.raises(RomnavError, match="name rom in its place"):
-        again.trials("safety", "nav-hum", 0)
+        trials.trials(again, "safety", "nav-hum", 0)
 
 
 def test_the_navigation_test_drives_the_rom_on_the_dev_episodes(tmp_path: Path) -> None:
-    test = plan(tmp_path).navigation()
-    assert test.upstream[-1] == plan(tmp_path).policy("rom", 0)
+    here = workspace(tmp_path)
+    test = navigation(here)
+    assert test.upstream[-1].name == "policy rom, seed 0"
+    assert test.upstream[-1].key == policy(here, "rom", 0).key
     assert {"locomotion", "gait library"} <= {stage.name for stage in test.upstream}
     assert [path.name for path in test.reads] == ["dev.json"]
     assert test.outputs == ("navigation.json",)

@@ -1,4 +1,4 @@
-"""What lies on disk: the folders of a project, and beside every stage's output a record of what made it."""
+"""What lies on disk beside every stage's output: a record of what made it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 
 from romnav import __version__
 from romnav.errors import RomnavError
-from romnav.experiment.plan import Stage, digest
+from romnav.experiment.graph.stage import Stage, digest
 from romnav.files import write
 
 _PACKAGES = ("torch", "rsl-rl-lib", "mujoco", "warp-lang", "numpy")
@@ -108,11 +108,14 @@ def begin(stage: Stage, resume: bool) -> Record:
 
 
 def finish(stage: Stage, record: Record, facts: dict[str, Any], seconds: float) -> None:
-    """Records a finished stage."""
+    """Records a finished stage; a record that would only tell of another time and place stays as it is."""
+    old = read(stage)
     above = {stage.name: read(stage) for stage in stage.upstream}
     record.upstream = {name: other.outputs for name, other in above.items() if other}
     record.outputs = {name: digest(stage.folder / name) for name in stage.outputs}
     record.facts = facts
+    if old and all(getattr(old, name) == getattr(record, name) for name in ("key", "upstream", "outputs", "facts")):
+        return
     record.seconds = round(seconds, 1)
     record.provenance = provenance()
     _write(stage, record)
@@ -156,7 +159,7 @@ def _process() -> dict[str, Any]:
 
 def commit() -> str:
     """Git commit of the code, with ``-dirty`` where code or experiments differ; "unknown" without git."""
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     head = _git(root, "rev-parse", "HEAD")
     changed = _git(root, "status", "--porcelain", "--", "romnav", "experiments/*.toml", "pyproject.toml")
     return f"{head or 'unknown'}{'-dirty' if changed else ''}"

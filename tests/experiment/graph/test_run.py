@@ -4,6 +4,7 @@ import errno
 import json
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ from hypothesis import strategies as st
 
 from romnav.config import Config
 from romnav.errors import RomnavError
-from romnav.experiment import store
-from romnav.experiment.plan import Stage
-from romnav.experiment.run import execute, pending, require_trained, require_walking
+from romnav.experiment.graph import records
+from romnav.experiment.graph.run import execute, pending, require, waves, with_all_above
+from romnav.experiment.graph.stage import Session, Stage
 
 KEYS = "abcdef"
 
@@ -29,10 +30,18 @@ class Settings(Config):
     f: int = 0
 
 
+def write(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+    """Writes down the stage's setting and what it reads."""
+    read = [(above.folder / "out.txt").read_text() for above in stage.upstream]
+    stage.folder.mkdir(parents=True, exist_ok=True)
+    (stage.folder / "out.txt").write_text(json.dumps([stage.spec, read]))
+    return {"steps": 7}
+
+
 def stage(folder: Path, key: str, settings: Settings, upstream: tuple[Stage, ...] = (), **more: Any) -> Stage:
     """A stage named after the setting that it uses."""
     place = folder / key
-    more = {"kind": "copy", "outputs": ("out.txt",), **more}
+    more = {"kind": "copy", "outputs": ("out.txt",), "make": write, **more}
     return Stage(
         name=key,
         folder=place,
@@ -44,25 +53,11 @@ def stage(folder: Path, key: str, settings: Settings, upstream: tuple[Stage, ...
     )
 
 
-class Actions(dict):
-    """Stages that write down their setting and what they read, and that are counted."""
-
-    def __init__(self) -> None:
-        self.ran: list[str] = []
-        super().__init__(copy=self.copy_, policy=self.copy_)
-
-    def copy_(self, stage: Stage, progress: Callable[[int, int, str], None]) -> dict[str, Any]:
-        self.ran.append(stage.name)
-        read = [(above.folder / "out.txt").read_text() for above in stage.upstream]
-        stage.folder.mkdir(parents=True, exist_ok=True)
-        (stage.folder / "out.txt").write_text(json.dumps([stage.spec, read]))
-        return {"steps": 7}
-
-
 def run(targets: list[Stage], **options: Any) -> list[str]:
-    actions = Actions()
-    execute(pending(targets, **options), actions)
-    return actions.ran
+    """Names of the stages that ran."""
+    stages = pending(targets, **options)
+    execute(stages, Session())
+    return [stage.name for stage in stages]
 
 
 graphs = st.integers(1, 6).flatmap(
@@ -118,9 +113,9 @@ def test_a_missing_output_is_made_again_only_where_it_is_read(chain: list[Stage]
 def test_another_upstream_output_reruns_what_read_the_old_one(chain: list[Stage]) -> None:
     run(chain)
     (chain[0].folder / "out.txt").write_text("made by another machine")
-    record = store.read(chain[0])
+    record = records.read(chain[0])
     assert record is not None
-    store.finish(chain[0], record, {}, 0.0)
+    records.finish(chain[0], record, {}, 0.0)
     assert run(chain) == ["b", "c"]
 
 
@@ -141,10 +136,11 @@ def test_a_damaged_record_is_an_error(chain: list[Stage]) -> None:
 
 def test_stages_run_again_on_request_with_those_that_need_them(tmp_path: Path) -> None:
     a = stage(tmp_path, "a", Settings())
-    b = stage(tmp_path, "b", Settings(), (a,), kind="policy")
+    b = stage(tmp_path, "b", Settings(), (a,))
     c = stage(tmp_path, "c", Settings(), (b,))
     run([c])
-    assert run([c], again=("policy",)) == ["b", "c"]
+    assert run([c], again=[b]) == ["b", "c"]
+    assert run([c], again=with_all_above([c])) == ["a", "b", "c"]
 
 
 def test_an_edited_versioned_file_reruns_what_reads_it(tmp_path: Path) -> None:
@@ -157,24 +153,20 @@ def test_an_edited_versioned_file_reruns_what_reads_it(tmp_path: Path) -> None:
 
 
 def test_what_is_finished_stays_when_a_later_stage_fails(chain: list[Stage]) -> None:
-    actions = Actions()
-
-    def full(stage: Stage, progress: Any) -> dict[str, Any]:
-        if stage.name == "b":
-            raise OSError(errno.ENOSPC, "No space left on device", str(stage.folder / "x.tmp"))
-        return actions.copy_(stage, progress)
+    def full(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        raise OSError(errno.ENOSPC, "No space left on device", str(stage.folder / "x.tmp"))
 
     with pytest.raises(RomnavError, match=r"b/x\.tmp: cannot be written \(no space left on device\); free some"):
-        execute(pending(chain), {"copy": full})
+        execute([chain[0], replace(chain[1], make=full), chain[2]], Session())
     assert run(chain) == ["b", "c"]
 
 
 def test_an_error_that_is_no_full_disk_is_not_hidden(chain: list[Stage]) -> None:
-    def broken(stage: Stage, progress: Any) -> dict[str, Any]:
+    def broken(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
         raise FileNotFoundError(errno.ENOENT, "No such file or directory", "x")
 
     with pytest.raises(FileNotFoundError):
-        execute(pending(chain), {"copy": broken})
+        execute([replace(chain[0], make=broken)], Session())
 
 
 @pytest.fixture
@@ -182,7 +174,7 @@ def resumable(tmp_path: Path) -> Callable[[Settings], Stage]:
     return lambda settings: stage(tmp_path, "a", settings, scratch=("checkpoint.pt",))
 
 
-def interrupt(stage: Stage, progress: Any) -> dict[str, Any]:
+def interrupt(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
     checkpoint = stage.folder / "checkpoint.pt"
     checkpoint.write_text(checkpoint.read_text() + "+" if checkpoint.exists() else "1")
     raise KeyboardInterrupt
@@ -203,7 +195,7 @@ def test_an_interrupted_stage_resumes_only_its_own_checkpoint(
 ) -> None:
     for chosen, keep in ((Settings(), True), (second, resume)):
         with pytest.raises(KeyboardInterrupt):
-            execute(pending([resumable(chosen)]), {"copy": interrupt}, resume=keep)
+            execute([replace(resumable(chosen), make=interrupt)], Session(resume=keep))
     assert (resumable(second).folder / "checkpoint.pt").read_text() == expected
     assert run([resumable(second)]) == ["a"]
 
@@ -212,19 +204,21 @@ def test_a_folder_that_cannot_be_written_fails_before_the_work(
     resumable: Callable[[Settings], Stage], tmp_path: Path
 ) -> None:
     (tmp_path / "a").write_text("a file in place of the folder")
-    actions = Actions()
+
+    def work(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        raise AssertionError("ran")
+
     with pytest.raises(RomnavError, match="cannot be written"):
-        execute([resumable(Settings())], actions)
-    assert actions.ran == []
+        execute([replace(resumable(Settings()), make=work)], Session())
 
 
 def test_the_record_tells_what_made_the_output(chain: list[Stage]) -> None:
     run(chain)
-    record = store.read(chain[1])
+    record = records.read(chain[1])
     assert record is not None
     assert record.spec["b"] == 0
     assert record.facts == {"steps": 7}
-    assert record.upstream == {"a": store.read(chain[0]).outputs}  # type: ignore[union-attr]
+    assert record.upstream == {"a": records.read(chain[0]).outputs}  # type: ignore[union-attr]
     assert {"commit", "torch", "python", "machine"} <= set(record.provenance)
 
 
@@ -232,33 +226,65 @@ def test_changed_settings_are_named(chain: list[Stage], tmp_path: Path) -> None:
     run(chain)
     said: list[str] = []
     after = build(tmp_path, (set(), {0}, {1}), Settings(b=3))
-    execute(pending(after), Actions(), say=said.append)
+    execute(pending(after), Session(), said.append)
     assert said == ["b (changed: b: 0 -> 3)", "c"]
 
 
-def test_evaluation_requires_trained_policies(tmp_path: Path) -> None:
-    def evaluation(settings: Settings) -> list[Stage]:
-        policy = stage(tmp_path, "a", settings, kind="policy", arm="rom")
-        return [stage(tmp_path, "b", settings, (policy,))]
+def test_what_another_stage_needs_is_missing_unfinished_or_changed(tmp_path: Path) -> None:
+    def needed(settings: Settings, **more: Any) -> Stage:
+        return stage(tmp_path, "a", settings, command=("train", "policy", "rom"), scratch=("checkpoint.pt",), **more)
 
-    with pytest.raises(RomnavError, match="a is not trained; run `romnav train policy rom`"):
-        require_trained(evaluation(Settings()))
-    run(evaluation(Settings()))
-    require_trained(evaluation(Settings()))
-    with pytest.raises(RomnavError, match=r"a was trained with other settings \(a: 0 -> 1\)"):
-        require_trained(evaluation(Settings(a=1)))
+    reader = stage(tmp_path, "b", Settings())
+    with pytest.raises(RomnavError, match="a is missing, and b needs it; run `romnav train policy rom`"):
+        require(needed(Settings()), reader)
+    with pytest.raises(KeyboardInterrupt):
+        execute([needed(Settings(), make=interrupt)], Session())
+    with pytest.raises(RomnavError, match="a is unfinished, or something that it was made from has changed since"):
+        require(needed(Settings()), reader)
+    run([needed(Settings())])
+    require(needed(Settings()), reader)
+    with pytest.raises(RomnavError, match=r"a was made with other settings \(a: 0 -> 1\)"):
+        require(needed(Settings(a=1)), reader)
 
 
-def test_no_locomotion_policy_is_trained_by_accident(tmp_path: Path) -> None:
-    walked = stage(tmp_path, "a", Settings(), kind="locomotion")
-    library = stage(tmp_path, "b", Settings(), (walked,), kind="gaits")
-    episodes = stage(tmp_path, "c", Settings(), (walked, library), kind="episodes")
-    actions = dict.fromkeys(("locomotion", "gaits", "episodes"), Actions().copy_)
-    require_walking(pending([library]))
-    with pytest.raises(RomnavError, match=r"robots of c is not trained to the end; run `romnav train locomotion`"):
-        require_walking(pending([episodes]))
-    execute(pending([library]), actions)
-    require_walking(pending([episodes]))
-    changed = stage(tmp_path, "a", Settings(a=5), kind="locomotion")
-    with pytest.raises(RomnavError, match=r"trained with other settings \(a: 0 -> 5\)"):
-        require_walking(pending([stage(tmp_path, "c", Settings(), (changed,), kind="episodes")]))
+def test_what_is_made_on_request_is_not_made_on_the_way(tmp_path: Path) -> None:
+    def long(settings: Settings) -> Stage:
+        return stage(tmp_path, "a", settings, command=("train", "locomotion"), on_request=True)
+
+    library = stage(tmp_path, "b", Settings(), (long(Settings()),))
+    episodes = stage(tmp_path, "c", Settings(), (library,))
+    with pytest.raises(RomnavError, match="a is missing, and b needs it; run `romnav train locomotion`"):
+        pending([episodes])
+    assert run([long(Settings())]) == ["a"]
+    assert run([episodes]) == ["b", "c"]
+    assert run([episodes], again=with_all_above([episodes])) == ["b", "c"]
+    changed = stage(tmp_path, "b", Settings(), (long(Settings(a=5)),))
+    with pytest.raises(RomnavError, match=r"a was made with other settings \(a: 0 -> 5\)"):
+        pending([changed])
+
+
+@given(graph=graphs)
+def test_a_wave_needs_nothing_of_itself_or_later(graph: tuple[set[int], ...]) -> None:
+    stages = build(Path("nowhere"), graph, Settings())
+    groups = waves(stages)
+    assert sorted(stage.name for group in groups for stage in group) == [*KEYS[: len(graph)]]
+    done: set[str] = set()
+    for group in groups:
+        assert all(above.name in done for stage in group for above in stage.upstream)
+        done |= {stage.name for stage in group}
+    assert all(groups)
+
+
+def test_a_record_stays_as_it_is_when_the_same_comes_out(chain: list[Stage]) -> None:
+    run(chain)
+    before = chain[1].record.read_text()
+    (chain[1].folder / "out.txt").unlink()
+    assert run(chain[1:2]) == ["b"]
+    assert chain[1].record.read_text() == before
+    run([stage(chain[1].folder.parent, "b", Settings(b=1), chain[1].upstream)])
+    assert chain[1].record.read_text() != before
+
+
+def test_a_device_that_is_not_there_is_one_clear_error() -> None:
+    with pytest.raises(RomnavError, match=r"device cdua: .*; use cpu, cuda or cuda:N"):
+        Session("cdua")

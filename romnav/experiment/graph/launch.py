@@ -6,40 +6,28 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from romnav.errors import RomnavError
-from romnav.experiment.plan import Plan, Stage
+from romnav.experiment.graph.run import execute, waves
+from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import lines
 
-COMMANDS = {"policy": ("train", "policy"), "episodes": ("eval",)}
-"""Command that makes the output of a kind of stage, given the arm."""
 
-
-def stages_side_by_side(plan: Plan, stages: Sequence[Stage], resume: bool) -> None:
-    """Train or evaluate arms, as many at a time as there are cores: a thread each does more than sharing them.
+def execute_side_by_side(stages: Iterable[Stage], session: Session, say: Callable[[str], None]) -> None:
+    """Runs stages on the CPU, those that have a command of their own as many at a time as there are cores: a thread
+    each does more than sharing them.
 
     Raises:
-        RomnavError: One of them failed.
+        RomnavError: A stage cannot do or write what it should.
     """
-    options = ["--scale", plan.scale.name, *([] if resume else ["--no-resume"])]
-    elsewhere = plan.project.results != plan.project.root / "results"
-    where = ["--results", str(plan.project.results)] if elsewhere else []
+    over = [] if session.resume else ["--no-resume"]
     for wave in waves(stages):
-        commands = {s.name: [*where, *COMMANDS[s.kind], str(s.arm), "--seed", str(s.seed), *options] for s in wave}
-        side_by_side(commands, os.cpu_count() or 1)
-
-
-def waves(stages: Sequence[Stage]) -> list[list[Stage]]:
-    """Stages in the order of their waves: each needs none of its own wave or of a later one."""
-    left, done = list(stages), list[list[Stage]]()
-    while left:
-        names = {stage.name for stage in left}
-        ready = [stage for stage in left if not names & {above.name for above in stage.upstream}]
-        done.append(ready)
-        left = [stage for stage in left if stage not in ready]
-    return done
+        commands = {stage.name: [*stage.command, *over] for stage in wave if stage.command}
+        if commands:
+            side_by_side(commands, os.cpu_count() or 1)
+        execute([stage for stage in wave if not stage.command], session, say)
 
 
 def side_by_side(commands: Mapping[str, Sequence[str]], workers: int) -> None:

@@ -1,0 +1,117 @@
+"""Runs stages: only those whose output is missing or out of date, each with its progress and its record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+
+from romnav import files
+from romnav.errors import RomnavError
+from romnav.experiment.graph import records
+from romnav.experiment.graph.stage import Session, Stage
+from romnav.progress import bar
+
+
+def pending(targets: Collection[Stage], again: Collection[Stage] = ()) -> list[Stage]:
+    """The stages that must run for the targets to be finished, in order.
+
+    A stage whose output is gone runs only where another one has to read it. Stages in ``again`` run even if they are
+    finished, and so do those that need them.
+
+    Raises:
+        RomnavError: A target needs a stage that is made on request alone.
+    """
+    asked, repeated = ({stage.name for stage in stages} for stages in (targets, again))
+    runs: dict[str, bool] = {}
+    ordered: list[Stage] = []
+
+    def forced(stage: Stage) -> bool:
+        return stage.name in repeated or any(map(forced, stage.upstream))
+
+    def visit(stage: Stage) -> None:
+        if stage.name in runs:
+            return
+        runs[stage.name] = forced(stage) or not records.finished(stage)
+        if runs[stage.name]:
+            for above in stage.upstream:
+                if above.on_request and above.name not in asked:
+                    require(above, stage)
+                visit(above)
+            ordered.append(stage)
+
+    for target in targets:
+        visit(target)
+    return ordered
+
+
+def require(stage: Stage, reader: Stage) -> None:
+    """Checks that a stage that ``reader`` needs is finished.
+
+    Raises:
+        RomnavError: It is not, or was made with other settings.
+    """
+    if records.finished(stage):
+        return
+    changed = "; ".join(records.differences(stage))
+    if changed:
+        reason = f"was made with other settings ({changed})"
+    elif stage.record.exists():
+        reason = "is unfinished, or something that it was made from has changed since"
+    else:
+        reason = "is missing"
+    command = " ".join(("romnav", *stage.command))
+    raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
+
+
+def with_all_above(stages: Iterable[Stage]) -> list[Stage]:
+    """The stages and all that they need, but for those that are made on request alone."""
+    found: dict[str, Stage] = {}
+
+    def visit(stage: Stage) -> None:
+        if stage.name not in found and not stage.on_request:
+            found[stage.name] = stage
+            for above in stage.upstream:
+                visit(above)
+
+    for stage in stages:
+        visit(stage)
+    return list(found.values())
+
+
+def waves(stages: Iterable[Stage]) -> list[list[Stage]]:
+    """Stages to run in groups: one after the other, each with what it needs in earlier ones or not at all."""
+    depth: dict[str, int] = {}
+    groups: list[list[Stage]] = []
+    for stage in stages:  # upstream ones come first
+        level = depth[stage.name] = 1 + max((depth.get(above.name, -1) for above in stage.upstream), default=-1)
+        groups += [[] for _ in range(level + 1 - len(groups))]
+        groups[level].append(stage)
+    return groups
+
+
+def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None] = lambda line: None) -> None:
+    """Runs stages one after the other; what is finished stays finished when a later one fails.
+
+    Args:
+        stages: In order.
+        session: On which device, and whether interrupted ones are continued.
+        say: Is told which stage begins, and which of its settings have changed since it last ran.
+
+    Raises:
+        RomnavError: A stage cannot do or write what it should.
+    """
+    records.provenance()  # looks up the commit now: another may be checked out before a long stage ends
+    for stage in stages:
+        changed = "; ".join(records.differences(stage))
+        say(f"{stage.name} (changed: {changed})" if changed else stage.name)
+        started = time.monotonic()
+        try:
+            record = records.begin(stage, session.resume)
+            with bar(stage.name) as progress:
+                facts = stage.make(stage, session, progress)
+        except OSError as error:
+            if error.errno not in files.HINTS:
+                raise
+            raise files.unwritable(Path(error.filename or stage.folder), error) from error
+        records.finish(stage, record, facts, time.monotonic() - started)

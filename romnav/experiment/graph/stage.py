@@ -1,0 +1,99 @@
+"""One step of an experiment: files in a folder, made from settings and the output of other steps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from romnav.config import Config
+from romnav.errors import RomnavError
+from romnav.progress import Progress
+
+
+@dataclass(frozen=True)
+class Session:
+    """How stages are run.
+
+    Raises:
+        RomnavError: There is no such device.
+    """
+
+    device: str = "cpu"
+    """Where numbers are computed: cpu, cuda or cuda:N."""
+    resume: bool = True
+    """Whether an interrupted stage is continued rather than started over."""
+
+    def __post_init__(self) -> None:
+        if self.device == "cpu":
+            return
+        import torch
+
+        try:
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0].rstrip(".")
+            raise RomnavError(f"device {self.device}: {reason}; use cpu, cuda or cuda:N") from error
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage: what it depends on, what it leaves behind, and how it is made."""
+
+    kind: str
+    """What it makes, in one word."""
+    name: str
+    """Unique within a scale, as shown to the user."""
+    folder: Path
+    """Where its output lies."""
+    outputs: tuple[str, ...]
+    """Files that it writes into its folder."""
+    record: Path
+    """File that tells what made the output."""
+    settings: Config
+    """Settings, of which it uses some."""
+    uses: tuple[str, ...]
+    """Dotted names of the settings that its output depends on."""
+    make: Callable[[Stage, Session, Progress], dict[str, Any]] = field(compare=False)
+    """Makes the output and returns facts worth recording, e.g. its training steps."""
+    reads: tuple[Path, ...] = ()
+    """Versioned files that its output depends on."""
+    upstream: tuple[Stage, ...] = ()
+    """Stages whose output it reads."""
+    scratch: tuple[str, ...] = ()
+    """Files from which an interrupted run continues; useless once a setting has changed."""
+    command: tuple[str, ...] = ()
+    """Words after ``romnav`` that make it alone, if there is such a command."""
+    on_request: bool = False
+    """Whether it is made only where it is asked for itself: nobody should begin it by accident."""
+    arm: str | None = None
+    """Arm that it trains or evaluates."""
+    seed: int | None = None
+    """Training seed of the arm."""
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """Everything that determines the output beside the upstream stages, as plain data."""
+        used = {name: attrgetter(name)(self.settings) for name in self.uses}
+        plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in used.items()}
+        read = {path.name: digest(path) if path.exists() else None for path in self.reads}
+        # through JSON, as the record is: a tuple there is a list
+        data: dict[str, Any] = json.loads(json.dumps({"arm": self.arm, "seed": self.seed, **plain, **read}))
+        return data
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of the specification and of every upstream key."""
+        text = json.dumps([self.kind, self.spec, [stage.key for stage in self.upstream]], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,98 @@
+"""What episodes and trials share: an arm, trained or scripted, that drives robots and leaves rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from romnav import __version__
+from romnav.experiment.graph import records
+from romnav.experiment.graph.stage import Stage, digest
+from romnav.experiment.kinds.locomotion import walking
+from romnav.experiment.kinds.policy import perception, policy
+from romnav.experiment.scales import Scale
+from romnav.experiment.spec import SCRIPTED
+from romnav.experiment.workspace import Workspace
+
+if TYPE_CHECKING:
+    from romnav.evaluation.rollout import Driver
+    from romnav.evaluation.rowfile import Provenance
+    from romnav.world.world import World
+
+NOISE = 1
+"""Seed of the sensor noise in evaluation: every arm meets the same noise in the same step of an episode."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """An arm that drives robots, with one training seed."""
+
+    work: Workspace
+    arm: str
+    seed: int
+    """0 for a scripted arm."""
+    policy: Stage | None
+    """What drives, if it is no script."""
+    settings: Scale
+    """Of the robots."""
+
+    @classmethod
+    def by(cls, work: Workspace, arm: str, seed: int) -> Driven:
+        """The arm as it drives: its own policy or script, or another arm's on a body of its own."""
+        driver = work.project.driver(arm)
+        trained = None if driver in SCRIPTED else policy(work, arm, seed)
+        settings = work.arm_settings(driver) if trained else work.settings
+        if driver != arm:
+            settings = settings.on_body(work.arm_settings(arm).navigation.dynamics)
+        return cls(work, arm, seed if trained else 0, trained, settings)
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Settings that tell rows apart beside those of the policy."""
+        if self.policy is None:
+            return "navigation.dynamics", "navigation.env"
+        return ("navigation.dynamics",) if self.policy.arm != self.arm else ()
+
+    @property
+    def upstream(self) -> tuple[Stage, ...]:
+        """The policy and what it needs, and what the robots need to walk."""
+        above = (*self.policy.upstream, self.policy) if self.policy else ()
+        present = {stage.name for stage in above}
+        return (*(stage for stage in walking(self.work, self.settings) if stage.name not in present), *above)
+
+    @property
+    def folder(self) -> Path:
+        """Where the rows lie."""
+        return self.work.folder / self.arm / f"seed-{self.seed}"
+
+    def driver(self, world: World, device: str) -> Driver:
+        """What commands the robots."""
+        from romnav.evaluation import rollout
+        from romnav.navigation import checkpoint
+
+        if self.policy is None:
+            return rollout.SCRIPTED[self.work.project.driver(self.arm)]()
+        seen = perception(self.work, self.policy, self.settings, world, noise=NOISE, device=device)
+        depth = seen.depth.encoder if seen.depth else None
+        path = self.policy.folder / "policy.pt"
+        return rollout.Policy(checkpoint.load_actor(path, seen.encoder, device, depth_encoder=depth), seen)
+
+    def provenance(self, stage: Stage, starts: str) -> Provenance:
+        """Where the rows of a stage come from; ``starts`` is the hash of the initial conditions."""
+        from romnav.evaluation.rowfile import Provenance
+
+        facts: dict[str, Any] = {"steps": 0, "hours": 0.0}
+        if self.policy and (record := records.read(self.policy)):
+            facts = record.facts
+        source = records.provenance()
+        return Provenance(
+            scale=self.work.scale,
+            commit=source["commit"],
+            spec_hash=stage.key[:16],
+            checkpoint_sha256=digest(self.policy.folder / "policy.pt") if self.policy else None,
+            episode_set=starts,
+            version=__version__,
+            machine=source["machine"],
+            **facts,
+        )

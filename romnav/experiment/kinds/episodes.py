@@ -1,0 +1,64 @@
+"""The episodes that all arms share, walked by one of them."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from romnav.experiment.graph.stage import Session, Stage
+from romnav.experiment.kinds._driven import Driven
+from romnav.experiment.kinds.locomotion import body
+from romnav.experiment.workspace import Workspace
+from romnav.progress import Progress
+
+
+def episodes(work: Workspace, arm: str, seed: int) -> Stage:
+    """The evaluated episodes of a trained or scripted arm."""
+    driven = Driven.by(work, arm, seed)
+    return Stage(
+        kind="episodes",
+        name=f"episodes {arm}, seed {driven.seed}",
+        folder=driven.folder,
+        outputs=("episodes.parquet",),
+        record=driven.folder / "episodes.json",
+        settings=driven.settings,
+        uses=("evaluation", *driven.uses),
+        make=partial(_evaluate, driven),
+        reads=(_set(work),),
+        upstream=driven.upstream,
+        command=work.command("eval", arm, "--seed", str(driven.seed)),
+        arm=arm,
+        seed=driven.seed,
+    )
+
+
+def _set(work: Workspace) -> Path:
+    return work.project.root / "experiments" / "episodes" / f"{work.settings.evaluation.episodes}.json"
+
+
+def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    from romnav.evaluation.episodes import load, terrain
+    from romnav.evaluation.paired import rows
+    from romnav.evaluation.paired.run import run
+
+    work, settings, path = driven.work, driven.settings, _set(driven.work)
+    paired = load(path)
+    world = terrain(paired, path, work.project.worlds).to(session.device)
+    robots = body(work, settings, driven.seed, session.device, settings.evaluation.threads)
+    driver = driven.driver(world, session.device)
+    measured = run(driver, world, paired, settings.navigation.env, settings.evaluation, progress, robots)
+    count = len(paired)
+    columns: dict[str, Any] = {
+        "arm": [driven.arm] * count,
+        "seed": [driven.seed] * count,
+        "episode": range(count),
+        "tile_class": [str(world.tiles[t].kind) for t in paired.columns["tile"]],
+        "multi_story": [world.tiles[t].multi_story for t in paired.columns["tile"]],
+        "level": ["cross" if cross else "same" for cross in paired.cross],
+        **{name: values for name, values in paired.columns.items() if name in rows.SCHEMA.names},
+        **measured,
+    }
+    made = rows.make(columns, driven.provenance(stage, paired.digest))
+    rows.write(stage.folder / "episodes.parquet", made)
+    return {}

@@ -1,0 +1,154 @@
+"""The navigation policy of an arm, and what it sees."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from romnav.errors import RomnavError
+from romnav.experiment.graph.stage import Session, Stage
+from romnav.experiment.kinds.encoder import SENSORS, encoder, make_sensor
+from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.scales import Scale
+from romnav.experiment.spec import suggest
+from romnav.experiment.workspace import Workspace
+from romnav.progress import Progress
+
+if TYPE_CHECKING:
+    from romnav.navigation.perception import Eye, Perception
+    from romnav.world.world import World
+
+DEPTH_NOISE = 1_000_003
+"""Added to the seed of the LiDAR's noise for that of the camera."""
+
+
+def policy(work: Workspace, arm: str, seed: int) -> Stage:
+    """The trained policy of an arm, or of the one whose policy it drives; a teacher is trained with the same seed.
+
+    Raises:
+        RomnavError: The teacher is no trained arm, or taught itself.
+    """
+    arm = work.project.driver(arm)
+    settings = work.arm_settings(arm)
+    folder = work.folder / arm / f"seed-{seed}"
+    encoders = _encoders(work, settings)
+    uses = ["world", "lidar", "navigation"]
+    if "lidar" not in encoders:
+        uses.append("pretrain.encoder")
+    if "depth" in encoders:
+        uses += ["depth", "pretrain_depth.corruption"]
+    teacher = [_teacher(work, arm, settings.kickstart.teacher, seed)] if settings.kickstart else []
+    if teacher:
+        uses.append("kickstart")
+    return Stage(
+        kind="policy",
+        name=f"policy {arm}, seed {seed}",
+        folder=folder,
+        outputs=("policy.pt", "curve.csv"),
+        record=folder / "spec.json",
+        settings=settings,
+        uses=tuple(uses),
+        make=partial(_train, work, settings),
+        upstream=(*encoders.values(), *teacher, *walking(work, settings)),
+        scratch=("checkpoint.pt", "curve.csv"),
+        command=work.command("train", "policy", arm, "--seed", str(seed)),
+        arm=arm,
+        seed=seed,
+    )
+
+
+def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
+    project = work.project
+    key = f"{project.file(project.having(arm)[0])}: arms.{arm}.kickstart.teacher"
+    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if not spec.policy}
+    if teacher not in trained:
+        raise RomnavError(f"{key}: no arm {teacher} that is trained{suggest(teacher, trained)}")
+    if work.arm_settings(teacher).kickstart:
+        raise RomnavError(f"{key}: {teacher} has a teacher itself; name one that was trained by PPO alone")
+    return policy(work, teacher, seed)
+
+
+def _encoders(work: Workspace, settings: Scale) -> dict[str, Stage]:
+    """Pretrained encoders of a policy that is trained with these settings, by sensor."""
+    sensors = ["lidar"] if settings.navigation.encoder.pretrained else []
+    if settings.navigation.dynamics == "g1":
+        sensors.append("depth")
+    return {sensor: encoder(work, sensor, settings) for sensor in sensors}
+
+
+def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    from romnav.navigation import checkpoint
+    from romnav.navigation.train import train
+    from romnav.world.build import build
+
+    world, seed = build(settings.world, work.project.worlds, progress), stage.seed or 0
+    teachers = [above.folder / "policy.pt" for above in stage.upstream if above.kind == "policy"]
+    path = train(
+        settings.navigation,
+        world,
+        perception(work, stage, settings, world, noise=seed, device=session.device),
+        stage.folder,
+        seed,
+        body=body(work, settings, seed, session.device, settings.navigation.ppo.threads),
+        kickstart=None if settings.kickstart is None else (settings.kickstart, teachers[0]),
+        device=session.device,
+        resume=session.resume,
+        progress=progress,
+    )
+    trained = checkpoint.read(path)
+    return {"steps": trained["steps"], "hours": trained["hours"]}
+
+
+def perception(
+    work: Workspace, trained: Stage, settings: Scale, world: World, *, noise: int, device: str
+) -> Perception:
+    """What a policy sees; through a depth camera, too, if its training had one.
+
+    Args:
+        work: Where encoders lie.
+        trained: Stage of the policy.
+        settings: Of the robots that it drives: other ones than in its training, maybe.
+        world: Where they are.
+        noise: Seed of the sensors' noise.
+        device: Where images are made.
+    """
+    from romnav.navigation.perception import Perception
+
+    pretrained = _encoders(work, work.arm_settings(str(trained.arm)))
+    noises = {"lidar": noise, "depth": noise + DEPTH_NOISE}
+    eyes = {
+        sensor: _eye(work, settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
+        for sensor in ("lidar", *(pretrained.keys() - {"lidar"}))
+    }
+    return Perception(**eyes)
+
+
+def _eye(
+    work: Workspace,
+    settings: Scale,
+    sensor: str,
+    pretrained: Stage | None,
+    seed: int,
+    world: World,
+    noise: int,
+    device: str,
+) -> Eye:
+    """A sensor with its pretrained encoder, or the random one that the training with ``seed`` began with."""
+    from romnav.navigation.perception import Eye
+    from romnav.robot.arms import OwnArms
+    from romnav.sensing import encoder as encoders
+    from romnav.sensing.corruption import Corruption
+
+    navigation, pretraining = settings.navigation, getattr(settings, SENSORS[sensor])
+    scanner = make_sensor(work, settings, sensor, world.tiles, device)
+    if pretrained:
+        made = encoders.load(pretrained.folder / "encoder.pt", pretraining.encoder, device)
+    else:
+        made = encoders.untrained(pretraining.encoder, scanner.directions, seed).encoder.to(device)
+    # a running sensor loses far fewer pixels than pretraining drops, a camera as a LiDAR
+    depth = pretraining.corruption.model_copy(update={"dropout": navigation.corruption.dropout})
+    corruption = Corruption(navigation.corruption if sensor == "lidar" else depth, noise, device)
+    arms = None
+    if navigation.dynamics == "g1":
+        arms = OwnArms(settings.locomotion.robot, scanner.directions, levelled=sensor == "lidar", device=device)
+    return Eye(scanner, corruption, made.requires_grad_(False), arms)

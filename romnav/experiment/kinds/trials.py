@@ -1,0 +1,129 @@
+"""Trials of an arm in scenes, with the safety filter off and on, and their report: a table and a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import romnav.world.scenes
+from romnav.errors import NothingRecorded, RomnavError
+from romnav.experiment.graph.stage import Session, Stage
+from romnav.experiment.kinds._driven import Driven
+from romnav.experiment.kinds.locomotion import humanoid
+from romnav.experiment.spec import SCRIPTED, Experiment, TrialKind
+from romnav.experiment.workspace import Workspace
+from romnav.progress import Progress
+
+if TYPE_CHECKING:
+    from romnav.world.scenes.scene import Scene
+
+SCENES = tuple(sorted(Path(romnav.world.scenes.__path__[0]).glob("[!_]*.py")))
+"""Descriptions of the scenes: trials in a scene that has been changed since are out of date."""
+
+
+def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
+    """The trials of a trained or scripted arm in scenes, with the safety filter off and on: on the humanoid if it walks
+    on that, otherwise on the reduced-order model with a body.
+
+    Raises:
+        RomnavError: The arm drives the policy of another one on the same body.
+    """
+    driver = work.project.driver(arm)
+    if driver != arm and work.arm_settings(arm).navigation.dynamics == "rom":
+        raise RomnavError(
+            f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.policy: trials drive the "
+            f"reduced-order model with a body; name {driver} in its place"
+        )
+    driven = Driven.by(work, arm, seed)
+    return Stage(
+        kind="trials",
+        name=f"{kind} {arm}, seed {driven.seed}",
+        folder=driven.folder,
+        outputs=(f"{kind}.parquet",),
+        record=driven.folder / f"{kind}.json",
+        settings=driven.settings,
+        uses=(kind, *driven.uses),
+        make=partial(_run, driven, kind),
+        reads=SCENES,
+        upstream=driven.upstream,
+        arm=arm,
+        seed=driven.seed,
+    )
+
+
+def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    from romnav.evaluation.trials import rows
+    from romnav.evaluation.trials.run import draw, run
+    from romnav.world.scenes.scene import scene_world
+
+    scenes = _scenes(kind)
+    world = scene_world(scenes).to(session.device)
+    settings, spec = driven.settings, getattr(driven.settings, kind)
+    walks = settings.navigation.dynamics == "g1"
+    columns = run(
+        driven.driver(world, session.device),
+        scenes,
+        world,
+        settings.navigation.env,
+        spec,
+        progress,
+        body=humanoid(driven.work, driven.seed, session.device, spec.threads) if walks else None,
+        arms=settings.locomotion.robot if walks else None,
+    )
+    provenance = driven.provenance(stage, draw(scenes, world, spec).digest)
+    rows.write(stage.folder / stage.outputs[0], rows.TrialRows(driven.arm, driven.seed, columns, provenance))
+    return {}
+
+
+def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
+    """Table and figure of an experiment that consists of trials, its arms beside the scripted ones."""
+    experiment = work.project.experiment(name)
+    if experiment.kind == "ablation":
+        return []
+    kind = experiment.kind
+    arms = [*((arm, seed) for arm in experiment.arms for seed in seeds), *((arm, 0) for arm in SCRIPTED)]
+    return [
+        Stage(
+            kind="report",
+            name=f"report {name}",
+            folder=work.folder,
+            outputs=(*(f"tables/{name}.{format}" for format in ("tex", "md", "csv")), f"figures/{name}.png"),
+            record=work.folder / "tables" / f"{name}.json",
+            settings=experiment,
+            uses=("labels",),
+            make=partial(_report, name, experiment, kind),
+            upstream=tuple(trials(work, kind, arm, seed) for arm, seed in arms),
+        )
+    ]
+
+
+def _report(
+    name: str, experiment: Experiment, kind: TrialKind, stage: Stage, session: Session, progress: Progress
+) -> dict[str, Any]:
+    """Of the arms that have been driven."""
+    from romnav.evaluation.trials import rows
+    from romnav.report import formats
+    from romnav.report.trials import pictures, tables
+
+    files = [above.folder / above.outputs[0] for above in stage.upstream]
+    runs = [rows.read(file) for file in files if file.exists()]
+    if not runs:
+        raise NothingRecorded(f"{files[0]}: no trials yet; run `romnav run {' '.join({kind: 0, name: 0})}`")
+    scenes = _scenes(kind)
+    tabulate, draw = {
+        "safety": (tables.safety, pictures.draw_safety),
+        "deploy": (tables.deploy, pictures.draw_deployments),
+    }[kind]
+    formats.write(replace(tabulate(runs, scenes, experiment.labels), name=name), stage.folder / "tables")
+    draw(runs[0], scenes, stage.folder / stage.outputs[-1])
+    return {}
+
+
+def _scenes(kind: TrialKind) -> tuple[Scene, ...]:
+    from romnav.world.scenes.deployments import deployment_scenes
+    from romnav.world.scenes.obstacles import obstacle_scenes
+
+    return {"safety": obstacle_scenes, "deploy": deployment_scenes}[kind]()

@@ -1,0 +1,51 @@
+"""A project at one scale: where stages lie, and with which settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from romnav.experiment.project import Project
+from romnav.experiment.scales import Scale, ScaleFile
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """A project at one scale.
+
+    Raises:
+        RomnavError: There is no such scale, or its file is invalid; where it is first needed.
+    """
+
+    project: Project
+    scale: str
+    """Name of the scale."""
+
+    @cached_property
+    def _file(self) -> ScaleFile:
+        return ScaleFile(self.project.root / "experiments" / "scales", self.scale)
+
+    @property
+    def settings(self) -> Scale:
+        """The settings of the scale."""
+        return self._file.settings
+
+    def arm_settings(self, arm: str) -> Scale:
+        """The scale's settings with the changes of a trained arm.
+
+        Raises:
+            RomnavError: No experiment has this arm, or its changes are invalid.
+        """
+        name, experiment = self.project.having(arm)
+        return self._file.changed(arm, experiment, self.project.file(name))
+
+    @property
+    def folder(self) -> Path:
+        """Results of this scale."""
+        return self.project.results / self.scale
+
+    def command(self, *words: str) -> tuple[str, ...]:
+        """A ``romnav`` command here, without that word."""
+        elsewhere = self.project.results != self.project.root / "results"
+        return (*words, "--scale", self.scale, *(("--results", str(self.project.results)) if elsewhere else ()))
