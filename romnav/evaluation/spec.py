@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -61,9 +61,8 @@ class TrialSpec(Config):
     """Largest angle at the start between heading and shortest path, rad (A)."""
     seed: int = Field(default=1000, ge=0)
     """Seed of starts, goals and sensor noise."""
-    dynamics: Literal["body"] = "body"
-    """What is driven: the reduced-order model with a body that touches the exact solids."""
     body: BodySpec = BodySpec()
+    """Of arms on the reduced-order model; those on the humanoid have its own."""
     filter: SafetySpec = SafetySpec()
     sensor: LidarSpec = LidarSpec()
     """What the filter sees, at the paper's resolution whatever the policy's; the mount is the robot's."""

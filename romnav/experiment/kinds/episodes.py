@@ -8,7 +8,7 @@ from typing import Any
 
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
-from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -16,8 +16,6 @@ from romnav.progress import Progress
 def episodes(work: Workspace, arm: str, seed: int) -> Stage:
     """The evaluated episodes of a trained or scripted arm."""
     driven = Driven.by(work, arm, seed)
-    present = {stage.name for stage in driven.upstream}
-    needed = [stage for stage in walking(work, driven.settings) if stage.name not in present]
     return Stage(
         kind="episodes",
         name=f"episodes {arm}, seed {driven.seed}",
@@ -28,7 +26,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(_set(work),),
-        upstream=(*needed, *driven.upstream),
+        upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
         seed=driven.seed,
