@@ -18,7 +18,7 @@ from _learner import load_world, ours, scale
 
 from romnav import files
 from romnav.experiment.graph import records
-from romnav.world.geodesic import GeodesicLookup
+from romnav.world.lookup import GeodesicLookup
 
 ENVS = (64, 128, 256, 512, 1024, 2048, 4096)
 TILES = (12, 24, 48, 96, 192, 256)

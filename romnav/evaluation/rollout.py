@@ -20,7 +20,7 @@ from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
 from romnav.robot.dynamics import Dynamics
 from romnav.robot.rom import ReducedOrderModel
-from romnav.world.geodesic import GeodesicLookup
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.world import World
 
 

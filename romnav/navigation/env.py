@@ -16,7 +16,7 @@ from romnav.navigation.observations import ACTIONS, Perceive, PrivilegedObservat
 from romnav.navigation.rewards import Transition, terms, weights
 from romnav.navigation.spec import CommandSpec, EnvSpec
 from romnav.robot.dynamics import Dynamics
-from romnav.world.geodesic import GeodesicLookup
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.spawns import Start, is_cross_level, sample
 from romnav.world.world import World
 

@@ -14,7 +14,7 @@ import torch
 from romnav import arrays
 from romnav.world import build as module
 from romnav.world.build import build
-from romnav.world.geodesic import GeodesicLookup
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.spec import WorldSpec
 from romnav.world.world import World
 

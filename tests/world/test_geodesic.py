@@ -12,8 +12,9 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from romnav.world.geodesic import GOAL, UNIT, UNREACHABLE, GeodesicLookup, fields, solve
+from romnav.world.geodesic import GOAL, UNIT, UNREACHABLE, fields, solve
 from romnav.world.grids import Grids, rasterise
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import GridSpec, WorldSpec
 from romnav.world.tile import Tile, TileClass

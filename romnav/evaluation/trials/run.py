@@ -32,7 +32,8 @@ from romnav.safety.filter import Filtered, SafetyFilter, Status
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.lidar import Lidar
 from romnav.threads import torch_threads
-from romnav.world.geodesic import UNIT, GeodesicLookup
+from romnav.world.geodesic import UNIT
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.scenes.scene import Scene
 from romnav.world.world import World
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.tracks import Tracks
 from romnav.report.pictures import draw_grid
-from romnav.world.geodesic import GeodesicLookup
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.world import World
 
 TRACK, SHORTEST = "#1f6fb4", "#7b3294"

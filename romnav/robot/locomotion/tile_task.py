@@ -11,7 +11,8 @@ from romnav.robot.g1 import Humanoids, build_spec
 from romnav.robot.locomotion.task import WalkingEnv, heading_of
 from romnav.robot.spec import LocomotionSpec
 from romnav.robot.tiles import TileGeoms, TileHeights, change_layer
-from romnav.world.geodesic import UNIT, GeodesicLookup
+from romnav.world.geodesic import UNIT
+from romnav.world.lookup import GeodesicLookup
 from romnav.world.world import LEVEL_GAP, MOUTH_RADIUS, World
 
 OVER_EDGE = 0.35
