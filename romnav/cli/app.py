@@ -39,6 +39,8 @@ app = typer.Typer(
 run = typer.Typer(no_args_is_help=True, help="Run an experiment from training to tables.")
 train = typer.Typer(no_args_is_help=True, help="Train one part.")
 play = typer.Typer(no_args_is_help=True, help="Draw what the parts make.")
+describe = typer.Typer(no_args_is_help=True, help="Tell what there is to learn.")
+app.add_typer(describe, name="describe")
 app.add_typer(run, name="run")
 app.add_typer(train, name="train")
 app.add_typer(play, name="play")

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from torch import Tensor
 
 from romnav import files
 from romnav.errors import RomnavError
@@ -96,9 +97,7 @@ def draw(name: str, spec: EpisodeSetSpec, world: World) -> EpisodeSet:
     tile = candidate % len(world.tiles)
     start = sample(world, spec.sampler, spec.seed, tile, candidate, torch.zeros_like(candidate))
     node = world.node_at(start.tile, start.layer, start.xy)
-    offset = world.field_start[start.goal] + node - world.node_start[start.tile]
-    geodesic = world.fields[offset].to(torch.float64) * UNIT
-    fits = ~torch.isin(node, world.spawn) & (geodesic <= spec.sampler.max_distance)
+    fits = ~torch.isin(node, world.spawn) & (geodesic(world, start) <= spec.sampler.max_distance)
     cross = is_cross_level(world.position[node, 2], world.position[world.goal[start.goal], 2])
     strata = [(fits & cross, spec.cross), (fits & ~cross, spec.episodes - spec.cross)]
     if any(int(stratum.sum()) < count for stratum, count in strata):
@@ -108,6 +107,11 @@ def draw(name: str, spec: EpisodeSetSpec, world: World) -> EpisodeSet:
         )
     taken = torch.cat([stratum.nonzero()[:count, 0] for stratum, count in strata]).sort().values
     start = Start(**{key: value[taken] for key, value in vars(start).items()})
+    return of(name, world, start)
+
+
+def of(name: str, world: World, start: Start) -> EpisodeSet:
+    """The set of given starts on ``world``."""
     goal = world.position[world.goal[start.goal]]
     values = {
         "tile": start.tile,
@@ -121,13 +125,20 @@ def draw(name: str, spec: EpisodeSetSpec, world: World) -> EpisodeSet:
         "goal_y": goal[:, 1],
         "goal_z": goal[:, 2],
         "goal_yaw": start.goal_yaw,
-        "geodesic": geodesic[taken],
+        "geodesic": geodesic(world, start),
     }
     columns = {
         key: values[key].numpy() if decimals == 0 else np.round(values[key].numpy().astype(np.float64), decimals)
         for key, decimals in COLUMNS
     }
-    return EpisodeSet(name, spec.world, columns)
+    return EpisodeSet(name, world.spec, columns)
+
+
+def geodesic(world: World, start: Start) -> Tensor:
+    """(E,) float64 shortest path from the cell of each start to its goal, m."""
+    node = world.node_at(start.tile, start.layer, start.xy)
+    offset = world.field_start[start.goal] + node - world.node_start[start.tile]
+    return world.fields[offset].to(torch.float64) * UNIT
 
 
 def save(path: Path, episodes: EpisodeSet) -> None:
@@ -180,11 +191,11 @@ def terrain(episodes: EpisodeSet, path: Path, cache: Path | None) -> World:
     stored = np.stack([episodes.columns[k] for k in ("goal_x", "goal_y", "goal_z")], axis=1)
     offset = world.field_start[goal] + node.clamp(min=0) - world.node_start[start.tile]
     inside = offset.clamp(0, len(world.fields) - 1)
-    geodesic = world.fields[inside].to(torch.float64).numpy() * UNIT
+    length = world.fields[inside].to(torch.float64).numpy() * UNIT
     wrong = (
         (node < 0).numpy()
         | (np.abs(position - stored).max(axis=1) > 2e-3)
-        | (np.abs(geodesic - episodes.columns["geodesic"]) > 2e-3)
+        | (np.abs(length - episodes.columns["geodesic"]) > 2e-3)
     )
     if wrong.any():
         raise RomnavError(

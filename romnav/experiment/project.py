@@ -32,6 +32,11 @@ class Project:
                 return cls(root, results or root / "results")
         raise RomnavError(f"{folder}: no experiments/ here or above; change to a copy of the romnav repository")
 
+    @property
+    def worlds(self) -> Path:
+        """Cache of what takes long to derive from terrain."""
+        return self.root / ".cache" / "worlds"
+
     @cached_property
     def experiments(self) -> dict[str, Experiment]:
         """Experiments by name."""

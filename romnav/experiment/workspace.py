@@ -45,11 +45,6 @@ class Workspace:
         """Results of this scale."""
         return self.project.results / self.scale
 
-    @property
-    def worlds(self) -> Path:
-        """Cache of terrain."""
-        return self.project.root / ".cache" / "worlds"
-
     def command(self, *words: str) -> tuple[str, ...]:
         """A ``romnav`` command here, without that word."""
         elsewhere = self.project.results != self.project.root / "results"

@@ -38,7 +38,7 @@ def test_tables_are_made_of_rows_alone(evaluated: Path) -> None:
     assert result.exit_code == 0
     assert "UniformNoCap" in result.stdout
     folder = evaluated / "results" / "smoke" / "tables"
-    names = [f"spawngoal-{kind}-rom.{end}" for kind in ("perf", "levels") for end in ("tex", "md", "csv")]
+    names = [f"spawngoal-{kind}-rom.{end}" for kind in ("perf", "levels", "success") for end in ("tex", "md", "csv")]
     assert sorted(p.name for p in folder.iterdir()) == sorted([*names, "spawn-goal.json"])
     before = {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix != ".json"}
     assert romnav("tables").exit_code == 0
@@ -101,7 +101,7 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     )
     assert romnav(*command).exit_code == 0
     assert ran == ["policy nocap, seed 0", "episodes nocap, seed 0"]
-    assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.99 -> 0.9)" in line for line in said)
+    assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.995 -> 0.9)" in line for line in said)
     ran.clear()
     assert romnav("train", "policy", "rom", "--no-resume").exit_code == 0
     assert ran == ["policy rom, seed 0"]

@@ -51,7 +51,7 @@ def _pretrain(
     from romnav.sensing.pretrain import pretrain
     from romnav.world.build import build
 
-    world = build(settings.world, work.worlds, progress)
+    world = build(settings.world, work.project.worlds, progress)
     scanner = make_sensor(work, settings, sensor, world.tiles, session.device)
     path = pretrain(
         getattr(settings, SENSORS[sensor]),
@@ -116,5 +116,5 @@ def make_sensor(
 
     solids = [tile.solids for tile in tiles]
     if sensor == "lidar":
-        return Lidar(solids, settings.lidar, device, work.worlds)
+        return Lidar(solids, settings.lidar, device, work.project.worlds)
     return DepthCamera(solids, settings.depth, device)

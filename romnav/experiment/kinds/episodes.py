@@ -52,7 +52,7 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
 
     work, settings, path = driven.work, driven.settings, _set(driven.work)
     paired = load(path)
-    world = terrain(paired, path, work.worlds).to(session.device)
+    world = terrain(paired, path, work.project.worlds).to(session.device)
     robots = body(work, settings, driven.seed, session.device, settings.evaluation.threads)
     driver = driven.driver(world, session.device)
     recorder = Recorder()

@@ -44,7 +44,7 @@ def _train(work: Workspace, stage: Stage, session: Session, progress: Progress) 
         device=session.device,
         resume=session.resume,
         progress=progress,
-        worlds=work.worlds,
+        worlds=work.project.worlds,
     )
     return training_cost(path)
 

@@ -91,6 +91,11 @@ _FAILURES = tuple(
     for metric, name in (("falls", "Falls"), ("timeouts", "Timeouts"))
     for level in ("same", "cross")
 )
+_SUCCESSES = tuple(
+    Column(f"sr_{horizon}", f"{horizon} s, {level}", 1, max, level)
+    for horizon in HORIZONS
+    for level in ("same", "cross")
+)
 _ORACLE_HUM = Entry("oracle-hum", "Oracle (hum)", competes=False)
 _METRICS = (
     "SR@45 and SR@120 are success within 45 s (the training budget) and 120 s; T2G is the mean time to goal "
@@ -141,6 +146,25 @@ SPECS: tuple[PerformanceSpec | LevelsSpec, ...] = (
         ((_ROM_CYL,), (_SINGLE, _ROM_HUM, _ROM_NAV)),
         _FAILURES,
         (_ORACLE_HUM,),
+    ),
+    PerformanceSpec(
+        "nav-success",
+        "Success rates (%) within 45 s and 120 s, by same-level and cross-level goals. Bold marks the best humanoid "
+        "arm per column. The paper's follow from its totals, falls, timeouts and contrasts. *RoM (cyl) is evaluated on "
+        "RoM dynamics.",
+        _ROM_NAV,
+        ((_ROM_CYL,), (_SINGLE, _ROM_HUM, _ROM_NAV)),
+        _SUCCESSES,
+        (_ORACLE_HUM,),
+    ),
+    PerformanceSpec(
+        "spawngoal-success-rom",
+        "Spawn/goal ablation: success rates (%) within 45 s and 120 s, by same-level and cross-level goals. Bold marks "
+        "the best arm per column. The paper gives their contrasts alone.",
+        _ROM,
+        ((_ROM, *_ABLATIONS),),
+        _SUCCESSES,
+        _BOUNDS,
     ),
 )
 """The tables of the paper's Sec. IV that are made of paired episodes."""
@@ -209,7 +233,9 @@ def _performance(spec: PerformanceSpec, bootstrap: Bootstrap) -> tuple[_Blocks, 
         return number(paper.PERFORMANCE[arm].get(column.key, math.nan), column.decimals)
 
     bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
-    return _with_best(spec, (*spec.blocks, bounds), measured), _with_best(spec, spec.blocks, published)
+    known = {key for entry in spec.entries for key in paper.PERFORMANCE.get(entry.arm, ())}
+    blocks = spec.blocks if known & {column.key for column in spec.columns} else ()
+    return _with_best(spec, (*spec.blocks, bounds), measured), _with_best(spec, blocks, published)
 
 
 def _with_best(

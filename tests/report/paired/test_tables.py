@@ -89,8 +89,9 @@ def row(cells: list[list[str]], label: str, nth: int = 0) -> list[str]:
     return [line for line in cells if line[0] == label][nth][1:]
 
 
-def test_all_four_tables_are_built(built) -> None:
-    assert list(built) == ["spawngoal-perf-rom", "spawngoal-levels-rom", "nav-perf", "nav-levels", "nav-failures"]
+def test_every_table_is_built(built) -> None:
+    navigation = ["nav-perf", "nav-levels", "nav-failures", "nav-success"]
+    assert list(built) == ["spawngoal-perf-rom", "spawngoal-levels-rom", *navigation, "spawngoal-success-rom"]
 
 
 def test_performance_table(built, arms) -> None:
@@ -140,6 +141,35 @@ def test_failures_by_level_and_costs_of_training(built, arms) -> None:
     perf = read_latex(formats.latex(built["nav-perf"]))
     assert row(perf, "RoM-Nav")[-2:] == ["1.5", "0.2"]
     assert row(perf, "RoM-Nav", 1)[-2:] == ["--", "32.0"]
+
+
+def test_success_by_level(built, arms) -> None:
+    of = {arm.name: arm.runs[0].columns for arm in arms}
+    for name, arm, label in (("nav-success", "rom-hum", "RoM (hum)"), ("spawngoal-success-rom", "nocap", "NoCap")):
+        cells = read_latex(formats.latex(built[name]))
+        c = of[arm]
+        expected = [
+            f"{100 * (c['success_time'][c['level'] == level] <= horizon).mean():.1f}"
+            for horizon in (45, 120)
+            for level in ("same", "cross")
+        ]
+        assert [re.sub(r"\\textbf{(.*)}", r"\1", cell) for cell in row(cells, label)] == expected
+    assert row(read_latex(formats.latex(built["nav-success"])), "RoM (hum)", 1) == ["--", "--", "96.6", "78.8"]
+    sources = {block.source for block in built["spawngoal-success-rom"].blocks}
+    assert sources == {"ours"}  # the paper gives no rates by level for these arms
+
+
+def test_published_success_by_level_follows_from_what_the_paper_states() -> None:
+    cross = 488 / 1024
+    for arm in ("rom-nav", "rom-hum", "single-stage"):
+        of = paper.PERFORMANCE[arm]
+        assert cross * of["sr_120_cross"] + (1 - cross) * of["sr_120_same"] == pytest.approx(of["sr_120"], abs=0.2)
+        if arm != "single-stage":
+            assert of["sr_120_cross"] == pytest.approx(100.0 - of["falls_cross"] - of["timeouts_cross"], abs=0.05)
+        if arm != "rom-nav":
+            for level in ("same", "cross"):
+                difference = paper.PERFORMANCE["rom-nav"][f"sr_120_{level}"] - of[f"sr_120_{level}"]
+                assert difference == pytest.approx(paper.CONTRASTS["rom-nav", arm][120, level][0], abs=0.15)
 
 
 def test_ties_share_the_bold(episode_rows) -> None:

@@ -1,0 +1,60 @@
+"""Describing terrain."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import ROOT, edit, fails, romnav
+
+
+@pytest.fixture
+def small(project: Path) -> Path:
+    """A project with a scale of the user's own: three small tiles."""
+    text = (ROOT / "experiments" / "scales" / "smoke.toml").read_text()
+    world = '[world]\ntiles = 3\nside = 22.0\nclasses = ["building", "room", "room"]\n'
+    (project / "experiments" / "scales" / "mine.toml").write_text(text.replace("[world]\n", world, 1))
+    edit(project / "experiments" / "scales" / "mine.toml", "goals_per_tile = 64", "goals_per_tile = 8")
+    return project
+
+
+def test_a_world_is_described_for_every_sampler_of_an_experiment(small: Path) -> None:
+    result = romnav("describe", "world", "--scale", "mine", "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert list(told["samplers"]) == ["rom", "uniform", "nocap", "uniform-nocap"]
+    for shares in told["samplers"].values():
+        names = "mean_geodesic cross_share storey_share two_storey_share beyond_30 beyond_45 on_connector"
+        assert list(shares) == names.split()
+        assert all(0.0 <= v <= 1.0 for k, v in shares.items() if k != "mean_geodesic")
+    assert told["samplers"]["rom"]["beyond_30"] == 0.0
+    assert told["tiles"] == {"building": 1, "room": 2}
+    assert told["oracle_t2g"] > 1.0
+    assert 0.0 <= told["straight_sr_120_same"] <= 100.0
+    assert told["build_s"] > 0.0 < told["memory_mb"]
+    picture = small / "results" / "mine" / "figures" / "describe-spawn-goal.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+    again = romnav("describe", "world", "--scale", "mine", "--experiment", "pretrain", "--out", "here.png")
+    assert again.exit_code == 0, again.output
+    assert "1 building, 2 room" in again.stdout
+    assert "frozen" in again.stdout
+    assert "scratch" not in again.stdout  # the same sampler as the first arm's
+    assert (small / "here.png").exists()
+
+
+def test_a_bad_world_is_one_line_before_anything_is_built(small: Path) -> None:
+    scale = small / "experiments" / "scales" / "mine.toml"
+    edit(scale, "side = 22.0", "side = nan")
+    assert "mine.toml: key world.side: " in fails("describe", "world", "--scale", "mine")
+    edit(scale, "side = nan", "side = 22.1")
+    assert "whole number" in fails("describe", "world", "--scale", "mine")
+    assert "unknown experiment" in fails("describe", "world", "--experiment", "nothing")
+
+
+def test_arms_on_other_terrain_have_no_one_world(small: Path) -> None:
+    file = small / "experiments" / "spawn-goal.toml"
+    edit(file, "[arms.nocap]", "[arms.nocap]\nworld.seed = 4")
+    assert "arms.nocap.world differs" in fails("describe", "world", "--scale", "mine")
