@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from romnav.evaluation.difficulty import STOREY
 from romnav.evaluation.paired.metrics import LEVELS, evaluate
+from romnav.world.world import STOREY
 
 COLUMNS = (
     *("policy", "episodes", "iteration", "steps", "hours"),

@@ -95,4 +95,4 @@ def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
             f"run `romnav {shlex.join(stage.command)}`"
         )
     tracks, _ = read(stage.folder / "tracks.npz")
-    return EpisodeGallery(run, tracks, paired, terrain(paired, path, work.worlds))
+    return EpisodeGallery(run, tracks, paired, terrain(paired, path, work.project.worlds))
