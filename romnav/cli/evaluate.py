@@ -11,6 +11,7 @@ import typer
 from romnav.cli.app import app
 from romnav.cli.options import AtScale, DeviceJob, SeedOption, arms, command
 from romnav.cli.printing import print_table
+from romnav.errors import RomnavError
 
 KEPT_COLUMNS = {
     "arm": "arm",
@@ -46,6 +47,15 @@ TERRAIN_COLUMNS = {
     "velocity_error": "error m/s",
     "yaw_error": "error rad/s",
 }
+NAVIGATION_COLUMNS = {
+    "driver": "driver",
+    "place": "place",
+    "episodes": "episodes",
+    "fell": "fell",
+    "falls_per_100m": "falls/100 m",
+    "sr_45": "SR@45",
+    "sr_120": "SR@120",
+}
 CONTRAST_COLUMNS = {
     "a": "a",
     "b": "b",
@@ -74,16 +84,22 @@ def evaluate(
         bool, typer.Option("--kept", help="Judge what an arm's run has kept on the way, on the episodes for choices.")
     ] = False,
     seed: SeedOption = None,
+    navigation: Annotated[
+        bool,
+        typer.Option("--navigation", help="Of locomotion: driven by the oracle and rom over the dev episodes."),
+    ] = False,
 ) -> None:
-    """Evaluate arms on the episode set that all arms share, or the locomotion policy on its terrain test."""
+    """Evaluate arms on the episode set that all arms share, or the locomotion policy on its tests."""
     from romnav.experiment.graph.run import require
     from romnav.experiment.kinds.episodes import episodes
 
     if along:
         _judge_kept(job, names, seed)
         return
+    if navigation and "locomotion" not in names:
+        raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
     if "locomotion" in names:
-        _evaluate_locomotion(job)
+        (_test_navigation if navigation else _test_terrain)(job)
         names = [name for name in names if name != "locomotion"]
         if not names:
             return
@@ -128,7 +144,7 @@ def _judge_kept(job: DeviceJob, names: list[str], seed: int | None) -> None:
     print_table("Success of kept policies in percent", rows, KEPT_COLUMNS)
 
 
-def _evaluate_locomotion(job: DeviceJob) -> None:
+def _test_terrain(job: DeviceJob) -> None:
     from romnav.experiment.graph import records
     from romnav.experiment.kinds.locomotion import terrain
 
@@ -139,6 +155,17 @@ def _evaluate_locomotion(job: DeviceJob) -> None:
     rows = json.loads((test.folder / test.outputs[0]).read_text("utf-8"))
     rows = [row | {"yaw_error": turning.get(row["terrain"])} for row in rows]
     print_table("Locomotion, shares of trials", rows, TERRAIN_COLUMNS)
+
+
+def _test_navigation(job: DeviceJob) -> None:
+    from romnav.experiment.graph.run import require
+    from romnav.experiment.kinds.navigation import navigation
+
+    test = navigation(job.work)
+    require(test.upstream[-1], test)
+    job.make([test])
+    rows = json.loads((test.folder / test.outputs[0]).read_text("utf-8"))
+    print_table("Locomotion under navigation, shares of episodes", rows, NAVIGATION_COLUMNS)
 
 
 def _collect(at: AtScale) -> dict[str, Any]:

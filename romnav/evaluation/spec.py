@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -43,7 +43,7 @@ class EvaluationSpec(Config):
     duration: float = 120.0
     """Longest episode, s (P); success within 45 s is read off the same episode."""
     reach: float = 0.5
-    """Distance to the goal that is success, in 3D, m (P)."""
+    """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""
     threads: int = 1
     """PyTorch threads (A: another number gives other bits)."""
 
@@ -56,14 +56,13 @@ class TrialSpec(Config):
     duration: float = Field(default=60.0, gt=0.0)
     """Longest trial, s (A: several times what the paper's trials took)."""
     reach: float = 0.5
-    """Distance to the goal that is success, in 3D, m (P)."""
+    """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""
     heading: float = Field(default=math.pi / 4, ge=0.0)
     """Largest angle at the start between heading and shortest path, rad (A)."""
     seed: int = Field(default=1000, ge=0)
     """Seed of starts, goals and sensor noise."""
-    dynamics: Literal["body"] = "body"
-    """What is driven: the reduced-order model with a body that touches the exact solids."""
     body: BodySpec = BodySpec()
+    """Of arms on the reduced-order model; those on the humanoid have its own."""
     filter: SafetySpec = SafetySpec()
     sensor: LidarSpec = LidarSpec()
     """What the filter sees, at the paper's resolution whatever the policy's; the mount is the robot's."""

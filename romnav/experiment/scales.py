@@ -44,6 +44,10 @@ class Scale(Config):
     deploy: DeploymentSpec = DeploymentSpec()
     """Trials in the deployments."""
 
+    def on_body(self, dynamics: str) -> Scale:
+        """The same with robots of another body."""
+        return self.model_copy(update={"navigation": self.navigation.model_copy(update={"dynamics": dynamics})})
+
 
 class ScaleFile:
     """A scale, and what becomes of it when an arm changes some of its settings.

@@ -13,6 +13,17 @@ from romnav.sensing.encoder import Encoder
 from romnav.sensing.lidar import Lidar
 
 
+def viewpoint(robot: Dynamics, mount: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Origin (E, 3), m, yaw (E,) and tilt (E, 2), rad, of the sensors in the heads of ``robot``.
+
+    A body without a head has them upright at ``mount`` (3,) above the ground that it stands on (paper, Sec. III-C).
+    """
+    head = robot.head
+    if head is None:
+        return robot.position + mount, robot.yaw, None
+    return head.origin, head.yaw, head.tilt
+
+
 class Eye:
     """One sensor, what is done to its images, and the frozen encoder of them.
 
@@ -36,15 +47,10 @@ class Eye:
         """(E, rows, columns) images in m, 0 where there is no return.
 
         Args:
-            robot: Carries the sensor in its head; one without a head has it above the ground it stands on (paper,
-                Sec. III-C).
+            robot: Carries the sensor in its head.
             counters: (E, 2) environment and step, which name the random numbers of the corruption.
         """
-        head = robot.head
-        if head is None:
-            origin, yaw, tilt = robot.position + self._mount, robot.yaw, None
-        else:
-            origin, yaw, tilt = head
+        origin, yaw, tilt = viewpoint(robot, self._mount)
         ranges = self.sensor.scan(robot.tile.to(torch.int32), origin, yaw, tilt=tilt)
         if self.arms is not None and tilt is not None:
             ranges = torch.where(self.arms(tilt), 0.0, ranges)

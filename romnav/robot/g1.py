@@ -29,6 +29,8 @@ FOOT_LENGTH, FOOT_WIDTH = 0.185, 0.07
 """Size of the sole, m."""
 HEAD = (0.0003, 0.0, 0.4284)
 """Sensors in the frame of the torso, m (Unitree's URDF: `torso_link` to `mid360_link`)."""
+OBSTACLES = "obstacles"
+"""Body of the ground that feet should not touch."""
 _SOLE_RADIUS = 0.01
 _BEGIN = 1.0
 """Time of a robot that is placed, s: one that MuJoCo had to reset is at 0."""
@@ -38,7 +40,7 @@ class Statics(Protocol):
     """What stands on the plane z = 0."""
 
     def add_to(self, model: mujoco.MjSpec) -> None:
-        """Add collision geoms to the world body."""
+        """Add collision geoms: what is walked on to the world body, what is in the way to the body `OBSTACLES`."""
         ...
 
 
@@ -150,9 +152,11 @@ def build_spec(spec: RobotSpec, ground: Statics, *, visual: bool = False) -> muj
 
     world = model.worldbody
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
+    world.add_body(name=OBSTACLES)
     ground.add_to(model)
     for body in model.bodies:
-        if any(geom.contype or geom.conaffinity for geom in body.geoms) and body.name != "world":
+        touchable = any(geom.contype or geom.conaffinity for geom in body.geoms)
+        if touchable and body.name not in ("world", OBSTACLES):
             model.add_sensor(
                 name=f"touch_{body.name}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -160,6 +164,16 @@ def build_spec(spec: RobotSpec, ground: Statics, *, visual: bool = False) -> muj
                 objname=body.name,
                 intprm=[1, 3, 1],
             )
+    for side in SIDES:
+        model.add_sensor(
+            name=f"wall_{side}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=f"{side}_ankle_roll_link",
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname=OBSTACLES,
+            intprm=[1, 3, 1],
+        )
     model.add_sensor(
         name="com_velocity", type=mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
         objtype=mujoco.mjtObj.mjOBJ_BODY, objname="pelvis",
@@ -187,6 +201,7 @@ class Robots(ABC):
         torso, torso_rotation: (n, 3), (n, 3, 3) of the body that carries the head, world.
         anchor, axis: (n, 15, 3) joint anchors and axes, world.
         touch: (n, bodies) whether each collision body is in contact; `feet` are the columns of the feet.
+        kicks: (n, 2) whether each foot is in contact with an obstacle.
         torque: (n, 15) of the actuators, N m.
         lost: (n,) whether the state stopped being finite since the robot was placed: the engine began anew.
     """
@@ -203,6 +218,7 @@ class Robots(ABC):
         ]
         self.touch_names = [sensor.name.removeprefix("touch_") for sensor in touch]
         self._touch = [int(sensor.adr[0]) for sensor in touch]
+        self._kicks = [int(self.model.sensor(f"wall_{side}").adr[0]) for side in SIDES]
         self._com_velocity = int(self.model.sensor("com_velocity").adr[0])
         self.feet = [self.touch_names.index(f"{side}_ankle_roll_link") for side in SIDES]
         self._ankles = [self.model.body(f"{side}_ankle_roll_link").id for side in SIDES]
@@ -221,7 +237,9 @@ class Robots(ABC):
         self.velocity, self.spin, self.joint_velocity = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
         self.orientation = xmat[:, 1].reshape(-1, 3, 3)
         self.com = self._field("subtree_com")[:, 1]
-        self.com_velocity = self._field("sensordata")[:, self._com_velocity : self._com_velocity + 3]
+        sensed = self._field("sensordata")
+        self.com_velocity = sensed[:, self._com_velocity : self._com_velocity + 3]
+        self.kicks = sensed[:, self._kicks] > 0
         self.ankle, self.ankle_rotation = xpos[:, self._ankles], xmat[:, self._ankles].reshape(-1, 2, 3, 3)
         self.torso, self.torso_rotation = xpos[:, self._torso], xmat[:, self._torso].reshape(-1, 3, 3)
         self.anchor, self.axis = self._field("xanchor")[:, 1:], self._field("xaxis")[:, 1:]

@@ -170,6 +170,11 @@ class Humanoid:
         return torch.cat([phase, self.robots.spin, -self.robots.orientation[:, 2]], dim=1).nan_to_num()
 
     @property
+    def brink(self) -> Tensor:
+        """(E,) bool: no drop-off stops it, it falls."""
+        return torch.zeros_like(self.fallen)
+
+    @property
     def head(self) -> Head:
         """Sensors as the torso carries them."""
         turn = self.robots.torso_rotation.nan_to_num()
@@ -180,15 +185,16 @@ class Humanoid:
     @torch.no_grad()
     def step(self, command: Tensor) -> None:
         """Walk under the command (E, 3) for one period; who has fallen stays down."""
-        touched = torch.zeros_like(self.robots.touch)
+        touched, kicked = torch.zeros_like(self.robots.touch), torch.zeros_like(self.robots.kicks)
         for _ in range(self._ticks):
             self.control.refer(command, self._heights, self._first)
             action = self._policy(self.control.observe(command, self._heights))
             self.control.act(action, (~self.fallen).nonzero()[:, 0])
             self._first = torch.zeros_like(self._first)
             touched |= self.robots.touch
+            kicked |= self.robots.kicks
             self.fallen = self.fallen | has_fallen(self.robots)
-        touched[:, self.robots.feet] = False
+        touched[:, self.robots.feet] = kicked
         self.contacts = touched.sum(1).float()
         self._read()
 

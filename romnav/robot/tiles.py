@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from romnav.robot.g1 import OBSTACLES
 from romnav.world.mesh import triangulate
 from romnav.world.solids import Shape, Solids, SolidsBuilder
 from romnav.world.tile import Tile
@@ -42,10 +44,11 @@ class TileGeoms:
         standing = [_standing(tile.solids) for tile in tiles]
         inclined = [int(_inclined(solids).sum()) for solids in standing]
         upright = [len(solids) - n for solids, n in zip(standing, inclined, strict=True)]
-        return [cls(solids, max(upright), max(inclined)) for solids in standing]
+        # one more, so that the body of the obstacles is never empty
+        return [cls(solids, max(upright) + 1, max(inclined)) for solids in standing]
 
     def add_to(self, model: mujoco.MjSpec) -> None:
-        """Add the geoms to the world body."""
+        """Add the geoms: walking surfaces to the world body, obstacles to a body of their own."""
         tilted = _inclined(self.solids)
         for index in np.flatnonzero(~tilted):
             _add_upright(model, self.solids[index : index + 1])
@@ -83,14 +86,18 @@ def _add_upright(model: mujoco.MjSpec, solid: Solids) -> None:
     else:
         shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [u, v, half]}
         shape["quat"] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
-    model.worldbody.add_geom(pos=[x, y, middle], **shape, **_TOUCH)
+    _body(model, solid).add_geom(pos=[x, y, middle], **shape, **_TOUCH)
 
 
 def _add_mesh(model: mujoco.MjSpec, solid: Solids) -> None:
     mesh = model.add_mesh(name=f"solid{len(model.meshes)}")
     exact = triangulate(_blunt(solid))
     mesh.uservert, mesh.userface = exact.vertices.flatten(), exact.triangles.flatten()
-    model.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **_TOUCH)
+    _body(model, solid).add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **_TOUCH)
+
+
+def _body(model: mujoco.MjSpec, solid: Solids) -> Any:
+    return model.worldbody if solid.walkable[0] else model.body(OBSTACLES)
 
 
 def _blunt(solid: Solids) -> Solids:

@@ -20,6 +20,12 @@ def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> Non
     assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no locomotion policy; train one with")
 
 
+def test_the_navigation_test_is_of_the_locomotion_policy_and_needs_rom(project: Path) -> None:
+    assert fails("eval", "rom", "--navigation").startswith("--navigation: a test of the locomotion policy")
+    message = fails("eval", "locomotion", "--navigation")
+    assert "policy rom, seed 0 is missing, and navigation test needs it" in message
+
+
 def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
     message = fails("eval", "rom")
     assert "policy rom, seed 0 is missing, and episodes rom, seed 0 needs it" in message

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from romnav.robot.g1 import JOINTS, Boxes, Humanoids, build_spec
+from romnav.robot.g1 import FOOT_LENGTH, JOINTS, SOLE, Boxes, Humanoids, build_spec
 from romnav.robot.spec import RobotSpec
+from romnav.robot.tiles import TileGeoms
+from romnav.world.solids import SolidsBuilder
 
 PLANE = Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
 BLOCK = Boxes(np.array([[0.0, 0.0, 0.25]]), np.array([[3.0, 3.0, 0.25]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
@@ -102,3 +104,20 @@ def test_heavier_robots_sag_more_and_slippery_soles_slide() -> None:
         robots.step(bent)
     moved = robots.ankle[:, :, 1].mean(1) - before
     assert moved[2] > moved[0] + 0.01
+
+
+@pytest.mark.parametrize("obstacle", [True, False])
+def test_a_foot_kicks_an_obstacle_but_not_the_ground_that_it_walks_on(obstacle: bool) -> None:
+    """A slab lower than the shin, with its upright face in the left toes: a sill, or the next step of a stair."""
+    free = Humanoids(RobotSpec(), PLANE, 1, threads=1)
+    stand(free, 0.793)
+    toes = free.ankle[0, 0] + torch.tensor([SOLE[0] + FOOT_LENGTH / 2, 0.0, 0.0])
+    builder, deep, layers = SolidsBuilder(), 0.004, (-1, -1) if obstacle else (0, 0)
+    builder.box((float(toes[0]) - deep + 0.5, float(toes[1])), (1.0, 0.15), (0.0, 0.08), layers=layers)
+    robots = Humanoids(RobotSpec(), TileGeoms(builder.build(), 2, 0), 1, threads=1)
+    stand(robots, 0.793)
+    for _ in range(3):
+        robots.step(torch.zeros(1, 15))
+    assert robots.touch[0, robots.feet].all()
+    assert robots.kicks[0].tolist() == [obstacle, False]
+    assert robots.touch.sum() == 2

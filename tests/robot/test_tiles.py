@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from romnav.robot.g1 import build_spec
+from romnav.robot.g1 import OBSTACLES, build_spec
 from romnav.robot.spec import RobotSpec
 from romnav.robot.tiles import CELL, TileGeoms, TileHeights
 from romnav.world.spec import WorldSpec
@@ -31,6 +31,7 @@ def test_rays_hit_the_ground_at_the_heights_of_the_map(tiles: list[Tile]) -> Non
         walkable = tile.solids[tile.solids.walkable]
         model = mujoco.MjSpec()
         model.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+        model.worldbody.add_body(name=OBSTACLES)
         TileGeoms(walkable, len(walkable), len(walkable)).add_to(model)
         compiled = model.compile()
         data = mujoco.MjData(compiled)

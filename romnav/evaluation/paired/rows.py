@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pyarrow as pa
@@ -12,12 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from romnav.errors import RomnavError
 from romnav.evaluation.rowfile import POSES, Provenance, RowFile
+from romnav.world.spec import TileName
 
 HORIZONS = (45, 120)
 """Evaluation horizons, s (paper, Sec. IV-A): the training budget, and the end of an episode."""
 SUCCESS_RADIUS = 0.5
 """Distance to the goal that counts as success, m (paper, Sec. IV-A)."""
-TILE_CLASSES = ("outdoor", "room", "building")
+TILE_CLASSES = get_args(TileName)
 
 SCHEMA = pa.schema(
     [

@@ -6,8 +6,10 @@ batch and meet the same sensor noise, so that a trial with the filter on is the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,9 +21,13 @@ from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.rollout import Driver, Outcomes, View
 from romnav.evaluation.spec import TrialSpec
 from romnav.navigation.observations import rotate
+from romnav.navigation.perception import viewpoint
 from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
+from romnav.robot.arms import OwnArms
 from romnav.robot.body import BodyModel
+from romnav.robot.dynamics import Dynamics
+from romnav.robot.spec import RobotSpec
 from romnav.safety.filter import Filtered, SafetyFilter, Status
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.lidar import Lidar
@@ -86,26 +92,53 @@ def draw(scenes: Sequence[Scene], world: World, spec: TrialSpec) -> EpisodeSet:
     return EpisodeSet(name, world.spec, {key: value.numpy() for key, value in columns.items()})
 
 
+class TrialRobot(Dynamics, Protocol):
+    """A body for trials."""
+
+    @property
+    def brink(self) -> Tensor:
+        """(E,) bool a drop-off stopped it in the last step, in place of a fall."""
+        ...
+
+
+TrialBody = Callable[[World, int, float], TrialRobot]
+"""Makes the robots of a world, a number of them and a control period, s."""
+
+
 class Shield:
     """The safety filter of ``robots`` robots, fed by a LiDAR of its own."""
 
-    def __init__(self, world: World, robots: int, spec: TrialSpec, env: EnvSpec) -> None:
+    def __init__(
+        self, world: World, robots: int, spec: TrialSpec, env: EnvSpec, robot: RobotSpec | None = None
+    ) -> None:
+        """A filter that guards ``robots`` bodies without arms, or humanoids of the kind ``robot``."""
         device = str(world.node.device)
         limits = {"forward": env.command.forward, "reverse": env.command.reverse, "lateral": env.command.lateral}
         barrier = spec.filter.filter.model_copy(update={"period": env.period, **limits})
         self._lidar = Lidar([tile.solids for tile in world.tiles], spec.sensor, device)
+        self._arms = OwnArms(robot, self._lidar.directions, levelled=True, device=device) if robot else None
         self._corruption = Corruption(spec.corruption, spec.seed, device)
         self._filter = SafetyFilter(robots, spec.filter.model_copy(update={"filter": barrier}), device)
         self._mount = torch.tensor([0.0, 0.0, spec.sensor.height], device=device)
         self._pose = torch.full((robots, 4), torch.nan, device=device)
 
-    def __call__(
-        self, tile: Tensor, position: Tensor, yaw: Tensor, velocity: Tensor, noise: Tensor, step: int
-    ) -> Filtered:
-        """Filter velocities (B, 2) of robots that stand at ``position`` (B, 3), with sensor noise ``noise`` (B,)."""
-        ranges = self._lidar.scan(tile.to(torch.int32), position + self._mount, yaw)
+    def __call__(self, robot: Dynamics, guarded: Tensor, velocity: Tensor, noise: Tensor, step: int) -> Filtered:
+        """Filter velocities (B, 2) of the robots ``guarded`` (B,), with sensor noise ``noise`` (B,)."""
+        tile, position, yaw = robot.tile[guarded], robot.position[guarded], robot.yaw[guarded]
+        origin, heading, tilt = viewpoint(robot, self._mount)
+        origin, heading, tilt = origin[guarded], heading[guarded], None if tilt is None else tilt[guarded]
+        ranges = self._lidar.scan(tile.to(torch.int32), origin, heading, tilt=tilt)
+        if self._arms is not None and tilt is not None:
+            ranges = torch.where(self._arms(tilt), 0.0, ranges)
         ranges = self._corruption(ranges, noise, torch.full_like(noise, step))
-        points = ranges[..., None] * self._lidar.directions + self._mount
+        points = ranges[..., None] * self._lidar.directions
+        if tilt is None:
+            points = points + self._mount
+        else:
+            # the image is levelled, but the head is turned and ahead of the feet
+            above = torch.cat([rotate((origin - position)[:, :2], yaw), (origin - position)[:, 2:]], dim=1)
+            turned = rotate(points[..., :2].flatten(1, 2), yaw - heading).view_as(points[..., :2])
+            points = torch.cat([turned, points[..., 2:]], dim=-1) + above[:, None, None]
         pose = torch.cat([position, yaw[:, None]], dim=1)
         moved = pose - self._pose
         motion = torch.cat([rotate(moved[:, :2], self._pose[:, 3]), moved[:, 2:]], dim=1)
@@ -147,8 +180,11 @@ def run(
     env: EnvSpec,
     spec: TrialSpec,
     progress: Progress | None = None,
+    body: TrialBody | None = None,
+    arms: RobotSpec | None = None,
 ) -> dict[str, NDArray]:
-    """Drive every trial of ``scenes`` with the filter off and on; a trial ends at success or after ``spec.duration``.
+    """Drive every trial of ``scenes`` with the filter off and on; a trial ends at success, at a fall or after
+    ``spec.duration``. Robots are those that ``body`` makes, with the arms of ``arms``; by default cylinders.
 
     The driver's memory of its previous command is its own, not the filtered one.
 
@@ -162,7 +198,10 @@ def run(
         filtered = np.arange(count) >= len(episodes)
         names = np.array([scene.name for scene in scenes], object)
         kept = [name for name in twice.columns if name.startswith(("spawn_", "goal_")) or name == "geodesic"]
-        measured, log = _drive(driver, world, twice, torch.from_numpy(filtered), env, spec, progress)
+        robot = (body or partial(BodyModel, body=spec.body))(world, count, env.period)
+        view = View(world, twice, env, robot)
+        shield = Shield(world, int(filtered.sum()), spec, env, arms)
+        measured, log = _drive(driver, view, robot, shield, torch.from_numpy(filtered), spec, progress)
         return {
             "scene": names[twice.columns["tile"]],
             "filter": filtered,
@@ -175,20 +214,17 @@ def run(
 
 def _drive(
     driver: Driver,
-    world: World,
-    episodes: EpisodeSet,
+    view: View,
+    robot: TrialRobot,
+    shield: Shield,
     filtered: Tensor,
-    env: EnvSpec,
     spec: TrialSpec,
     progress: Progress | None,
 ) -> tuple[dict[str, NDArray], _Log]:
-    count, limit = len(episodes), round(spec.duration / env.period)
-    robot = BodyModel(world, count, env.period, spec.body)
-    view = View(world, episodes, env, robot)
+    count, limit = len(view.episode), round(spec.duration / view.env.period)
     view.noise = view.episode % (count // 2)
     filtered = filtered.to(view.episode.device)
     guarded = filtered.nonzero()[:, 0]
-    shield = Shield(world, len(guarded), spec, env)
     outcomes = Outcomes(view, spec.duration, spec.reach)
     log = _Log.of(limit, count)
     log.track[0] = _centimetres(robot.position)
@@ -198,8 +234,7 @@ def _drive(
         alive = outcomes.alive()
         if len(guarded):
             wanted = command[guarded, :2]
-            pose = robot.tile[guarded], robot.position[guarded], robot.yaw[guarded]
-            safe = shield(*pose, wanted, view.noise[guarded], step)
+            safe = shield(robot, guarded, wanted, view.noise[guarded], step)
             executed[guarded, :2] = safe.velocity
             at = view.episode[guarded].cpu().numpy()
             live = alive[guarded]

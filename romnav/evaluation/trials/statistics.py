@@ -29,6 +29,8 @@ class Summary:
     """Mean length of path over successes, m."""
     brinks: int
     """Trials in which a drop-off stopped the robot."""
+    falls: int
+    """Trials that a fall ended."""
     blocked: int
     """Trials that ended with the filter holding the robot."""
 
@@ -64,6 +66,7 @@ def summarise(rows: TrialRows, scene: str, filtered: bool, first: int | None = N
         time_std=float(time.std(ddof=1)) if len(time) > 1 else np.nan,
         path=float(path.mean()) if len(path) else np.nan,
         brinks=int((c["brink_time"] > 0).sum()),
+        falls=int((c["outcome"] == "fall").sum()),
         blocked=int(c["blocked"].sum()),
     )
 

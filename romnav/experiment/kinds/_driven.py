@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from romnav import __version__
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Stage, digest
+from romnav.experiment.kinds.locomotion import walking
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import SCRIPTED
@@ -43,8 +44,7 @@ class Driven:
         trained = None if driver in SCRIPTED else policy(work, arm, seed)
         settings = work.arm_settings(driver) if trained else work.settings
         if driver != arm:
-            body = {"dynamics": work.arm_settings(arm).navigation.dynamics}
-            settings = settings.model_copy(update={"navigation": settings.navigation.model_copy(update=body)})
+            settings = settings.on_body(work.arm_settings(arm).navigation.dynamics)
         return cls(work, arm, seed if trained else 0, trained, settings)
 
     @property
@@ -56,8 +56,10 @@ class Driven:
 
     @property
     def upstream(self) -> tuple[Stage, ...]:
-        """The policy and what it needs."""
-        return (*self.policy.upstream, self.policy) if self.policy else ()
+        """The policy and what it needs, and what the robots need to walk."""
+        above = (*self.policy.upstream, self.policy) if self.policy else ()
+        present = {stage.name for stage in above}
+        return (*(stage for stage in walking(self.work, self.settings) if stage.name not in present), *above)
 
     @property
     def folder(self) -> Path:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
-from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 def episodes(work: Workspace, arm: str, seed: int) -> Stage:
     """The evaluated episodes of a trained or scripted arm."""
     driven = Driven.by(work, arm, seed)
-    present = {stage.name for stage in driven.upstream}
-    needed = [stage for stage in walking(work, driven.settings) if stage.name not in present]
     return Stage(
         kind="episodes",
         name=f"episodes {arm}, seed {driven.seed}",
@@ -33,7 +31,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(_set(work),),
-        upstream=(*needed, *driven.upstream),
+        upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
         seed=driven.seed,

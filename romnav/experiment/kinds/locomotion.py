@@ -16,6 +16,8 @@ from romnav.progress import Progress
 
 if TYPE_CHECKING:
     from romnav.robot.dynamics import Body
+    from romnav.robot.humanoid import Humanoid
+    from romnav.world.world import World
 
 
 def locomotion(work: Workspace) -> Stage:
@@ -104,12 +106,21 @@ def body(work: Workspace, settings: Scale, seed: int, device: str, threads: int)
     """What makes the robots of these settings.
 
     Raises:
-        RomnavError: The humanoid is to walk on another device than the CPU; there is no gait library.
+        RomnavError: As `humanoid`.
     """
     from romnav.robot.rom import ReducedOrderModel
 
     if settings.navigation.dynamics == "rom":
         return ReducedOrderModel
+    return humanoid(work, seed, device, threads)
+
+
+def humanoid(work: Workspace, seed: int, device: str, threads: int) -> Callable[[World, int, float], Humanoid]:
+    """What makes robots that walk by the locomotion policy of the scale.
+
+    Raises:
+        RomnavError: They are to walk on another device than the CPU; there is no gait library.
+    """
     if device != "cpu":
         raise RomnavError(f"the humanoid has no physics engine on {device} here; use cpu")
     from romnav.robot.gaits import GaitLibrary

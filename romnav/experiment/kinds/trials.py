@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import romnav.world.scenes
 from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
+from romnav.experiment.kinds.locomotion import humanoid
 from romnav.experiment.spec import SCRIPTED, Experiment, TrialKind
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
@@ -23,12 +25,14 @@ SCENES = tuple(sorted(Path(romnav.world.scenes.__path__[0]).glob("[!_]*.py")))
 
 
 def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
-    """The trials of a trained or scripted arm in scenes, with the safety filter off and on.
+    """The trials of a trained or scripted arm in scenes, with the safety filter off and on: on the humanoid if it walks
+    on that, otherwise on the reduced-order model with a body.
 
     Raises:
-        RomnavError: The arm is another one on another body; trials have a body of their own.
+        RomnavError: The arm drives the policy of another one on the same body.
     """
-    if (driver := work.project.driver(arm)) != arm:
+    driver = work.project.driver(arm)
+    if driver != arm and work.arm_settings(arm).navigation.dynamics == "rom":
         raise RomnavError(
             f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.policy: trials drive the "
             f"reduced-order model with a body; name {driver} in its place"
@@ -57,8 +61,18 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
 
     scenes = _scenes(kind)
     world = scene_world(scenes).to(session.device)
-    env, spec = driven.settings.navigation.env, getattr(driven.settings, kind)
-    columns = run(driven.driver(world, session.device), scenes, world, env, spec, progress)
+    settings, spec = driven.settings, getattr(driven.settings, kind)
+    walks = settings.navigation.dynamics == "g1"
+    columns = run(
+        driven.driver(world, session.device),
+        scenes,
+        world,
+        settings.navigation.env,
+        spec,
+        progress,
+        body=humanoid(driven.work, driven.seed, session.device, spec.threads) if walks else None,
+        arms=settings.locomotion.robot if walks else None,
+    )
     provenance = driven.provenance(stage, draw(scenes, world, spec).digest)
     rows.write(stage.folder / stage.outputs[0], rows.TrialRows(driven.arm, driven.seed, columns, provenance))
     return {}
@@ -76,18 +90,18 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             kind="report",
             name=f"report {name}",
             folder=work.folder,
-            outputs=(*(f"tables/{kind}.{format}" for format in ("tex", "md", "csv")), f"figures/{kind}.png"),
+            outputs=(*(f"tables/{name}.{format}" for format in ("tex", "md", "csv")), f"figures/{name}.png"),
             record=work.folder / "tables" / f"{name}.json",
             settings=experiment,
             uses=("labels",),
-            make=partial(_report, experiment, kind),
+            make=partial(_report, name, experiment, kind),
             upstream=tuple(trials(work, kind, arm, seed) for arm, seed in arms),
         )
     ]
 
 
 def _report(
-    experiment: Experiment, kind: TrialKind, stage: Stage, session: Session, progress: Progress
+    name: str, experiment: Experiment, kind: TrialKind, stage: Stage, session: Session, progress: Progress
 ) -> dict[str, Any]:
     """Of the arms that have been driven."""
     from romnav.evaluation.trials import rows
@@ -97,13 +111,13 @@ def _report(
     files = [above.folder / above.outputs[0] for above in stage.upstream]
     runs = [rows.read(file) for file in files if file.exists()]
     if not runs:
-        raise NothingRecorded(f"{files[0]}: no trials yet; run `romnav run {kind}`")
+        raise NothingRecorded(f"{files[0]}: no trials yet; run `romnav run {' '.join({kind: 0, name: 0})}`")
     scenes = _scenes(kind)
     tabulate, draw = {
         "safety": (tables.safety, pictures.draw_safety),
         "deploy": (tables.deploy, pictures.draw_deployments),
     }[kind]
-    formats.write(tabulate(runs, scenes, experiment.labels), stage.folder / "tables")
+    formats.write(replace(tabulate(runs, scenes, experiment.labels), name=name), stage.folder / "tables")
     draw(runs[0], scenes, stage.folder / stage.outputs[-1])
     return {}
 

@@ -230,7 +230,7 @@ def _performance(spec: PerformanceSpec, bootstrap: Bootstrap) -> tuple[_Blocks, 
         return number(estimate.value, column.decimals, lo=estimate.lo, hi=estimate.hi, n=estimate.n)
 
     def published(arm: str, column: Column) -> Cell:
-        return number(paper.PERFORMANCE[arm].get(column.key, math.nan), column.decimals)
+        return number(paper.PERFORMANCE.get(arm, {}).get(column.key, math.nan), column.decimals)
 
     bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
     known = {key for entry in spec.entries for key in paper.PERFORMANCE.get(entry.arm, ())}
@@ -263,7 +263,7 @@ def _levels(spec: LevelsSpec, bootstrap: Bootstrap) -> tuple[_Blocks, _Blocks]:
         return number(c.diff, 1, sign=True, dagger=c.significant, **facts)
 
     def published(arm: str, horizon: int, level: Level) -> Cell:
-        diff, significant = paper.CONTRASTS[spec.reference.arm, arm][horizon, level]
+        diff, significant = paper.CONTRASTS.get((spec.reference.arm, arm), {}).get((horizon, level), (math.nan, False))
         return number(diff, 1, sign=True, dagger=significant)
 
     def rows(entries: Iterable[Entry], cell: Callable[[str, int, Level], Cell]) -> tuple[Row, ...]:

@@ -35,7 +35,7 @@ def draw_safety(run: TrialRows, scenes: Sequence[Scene], path: Path) -> None:
     for scene, column in zip(scenes, axes.T, strict=True):
         for filtered, ax in zip((False, True), column, strict=False):
             _draw_plan(ax, scene)
-            for trial in range(SHOWN):
+            for trial in range(min(SHOWN, len(run.of(scene.name, filtered)["trial"]))):
                 _draw_trial(ax, run, scene.name, filtered, trial)
             s = summarise(run, scene.name, filtered, SHOWN)
             state = "CBF" if filtered else "no CBF"

@@ -85,29 +85,39 @@ def deploy(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
                 last = (
                     number(s.path, 1, n=s.successes),
                     _share(s.brinks, s.n),
+                    _share(s.falls, s.n),
                     _share(s.blocked, s.n) if filtered else number(math.nan, 1),
                 )
                 rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last)))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
     published = [
-        Row(scene.label, (_of(1, 1), _of(0, 1), number(math.nan, 1), number(length, 0), *_dashes(2)))
+        Row(scene.label, (_of(1, 1), _of(0, 1), number(math.nan, 1), number(length, 0), *_dashes(3)))
         for scene, length in zip(scenes, paper.DEPLOYMENTS.values(), strict=True)
     ]
     blocks.append(Block("paper", "Paper (hardware, one trial each)", tuple(published)))
     trials = len(runs[0].of(scenes[0].name, False)["trial"])
     caption = (
         f"The four long deployments, {trials} starts each, safety filter (CBF) off and on. Time to goal and path are "
-        "over successes; collision: trials in which the body, a cylinder of 0.26 m, touches a solid; brink: trials in "
-        "which a drop-off stopped the robot, which the model cannot fall from; blocked: trials that ended with the "
-        "filter holding the robot. 95% Wilson intervals."
+        "over successes; collision: trials in which the body, a cylinder of 0.26 m or the humanoid's, touches a solid; "
+        "brink: trials in which a drop-off stopped the cylinder, which cannot fall; fell: trials that a fall of the "
+        "humanoid ended; blocked: trials that ended with the filter holding the robot. 95% Wilson intervals."
     )
     provenance, note = _provenance(runs, "trials")
     return Table(
         name="deploy",
         caption=f"{caption} {note}",
         spans=(),
-        header=("Deployment", "Success (%)", "Collision (%)", "Time (s)", "Path (m)", "Brink (%)", "Blocked (%)"),
-        columns=("success", "collision", "time", "path", "brink", "blocked"),
+        header=(
+            "Deployment",
+            "Success (%)",
+            "Collision (%)",
+            "Time (s)",
+            "Path (m)",
+            "Brink (%)",
+            "Fell (%)",
+            "Blocked (%)",
+        ),
+        columns=("success", "collision", "time", "path", "brink", "fell", "blocked"),
         blocks=tuple(blocks),
         provenance=provenance,
     )

@@ -9,6 +9,8 @@ from romnav.evaluation.spec import TrialSpec
 from romnav.evaluation.trials import run as trials
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.body import BodyModel
+from romnav.robot.dynamics import Head
+from romnav.robot.rom import ReducedOrderModel
 from romnav.safety.filter import Status
 from romnav.sensing.spec import LidarSpec
 from romnav.world.scenes.obstacles import obstacle_scenes
@@ -127,12 +129,45 @@ def test_blocked_is_held_and_stuck_at_the_end() -> None:
     assert columns["contact_time"].tolist() == pytest.approx([0.0, 1.0, 0.0])
 
 
-def test_the_shield_sees_a_tube_and_stops_before_it(world: World) -> None:
+class Facing(ReducedOrderModel):
+    """A robot 0.9 m before the vertical tube at (4.4, 5.5), with a head of its own or none."""
+
+    head: Head | None = None
+
+    def __init__(self, world: World) -> None:
+        super().__init__(world, 2, 0.2)
+        self.tile = torch.tensor([0, 2])
+        self.position = torch.tensor([[1.0, 1.0, 0.0], [3.5, 5.5, 0.0]])
+
+
+def guarded_velocity(world: World, robot: Facing) -> torch.Tensor:
     shield = trials.Shield(world, 1, TrialSpec(), EnvSpec())
-    tile = torch.tensor([2])
-    # 0.9 m before the vertical tube at (4.4, 5.5), and with the back to it
-    position = torch.tensor([[3.5, 5.5, 0.0]])
     wanted, noise = torch.tensor([[1.0, 0.0]]), torch.tensor([0])
-    safe = shield(tile, position, torch.zeros(1), wanted, noise, 1)
+    safe = shield(robot, torch.tensor([1]), wanted, noise, 1)
     assert safe.status[0] == Status.FILTERED
-    assert safe.velocity[0, 0] < 0.6
+    return safe.velocity[0]
+
+
+def test_the_shield_sees_a_tube_and_stops_before_it(world: World) -> None:
+    assert guarded_velocity(world, Facing(world))[0] < 0.6
+
+
+def test_the_shield_looks_through_a_head_that_is_turned_and_ahead_of_the_feet(world: World) -> None:
+    """What it sees is where it is, whatever the head does."""
+    standing, swaying = Facing(world), Facing(world)
+    height = TrialSpec().sensor.height
+    for yaw in (0.0, 2.0):
+        for robot in (standing, swaying):
+            robot.yaw = torch.tensor([0.0, yaw])
+        swaying.head = Head(
+            swaying.position + torch.tensor([0.06, -0.04, height - 0.05]), swaying.yaw + 0.3, torch.zeros(2, 2)
+        )
+        if yaw == 0.0:
+            a, b = (guarded_velocity(world, robot) for robot in (standing, swaying))
+            torch.testing.assert_close(a, b, atol=0.1, rtol=0)
+        else:
+            # with its back to the tube, nothing is in the way
+            shields = [trials.Shield(world, 1, TrialSpec(), EnvSpec()) for _ in range(2)]
+            wanted, noise = torch.tensor([[0.3, 0.0]]), torch.tensor([0])
+            for shield, robot in zip(shields, (standing, swaying), strict=True):
+                assert shield(robot, torch.tensor([1]), wanted, noise, 1).velocity[0, 0] > 0.29

@@ -13,6 +13,7 @@ from romnav.experiment.graph.stage import Stage
 from romnav.experiment.kinds import reports, trials
 from romnav.experiment.kinds.encoder import encoder, quality
 from romnav.experiment.kinds.episodes import episodes
+from romnav.experiment.kinds.navigation import navigation
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.project import Project
 from romnav.experiment.workspace import Workspace
@@ -236,8 +237,6 @@ def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> No
     changed = {name.removesuffix(", seed 0") for name in before if before[name] != after[name]}
     walking = {"episodes walked", "episodes guided", "episodes own", "policy own"}
     assert changed == {"locomotion", "gait library", "tables humanoid"} | walking
-    with pytest.raises(RomnavError, match=r"arms\.walked\.policy: trials drive .*; name rom in its place"):
-        trials.trials(here, "safety", "walked", 0)
 
 
 KICKSTART = """
@@ -282,3 +281,28 @@ def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: 
     here.project.file("kickstart").write_text(KICKSTART % teacher)
     with pytest.raises(RomnavError, match=f"arms.nav.kickstart.teacher: .*{match}"):
         policy(here, "nav", 0)
+
+
+def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % "rom")
+    for arm in ("nav", "nav-hum"):
+        trial = trials.trials(here, "safety", arm, 0)
+        assert {"locomotion", "gait library"} <= {stage.name for stage in trial.upstream}
+        assert trial.settings.navigation.dynamics == "g1"  # type: ignore[attr-defined]
+    assert "locomotion" not in everything(trials.trials(here, "safety", "rom", 0))
+    again = workspace(tmp_path / "again")
+    same_body = KICKSTART.replace('"rom"\nnavigation.dynamics = "g1"', '"rom"')
+    again.project.file("kickstart").write_text(same_body % "rom")
+    with pytest.raises(RomnavError, match="name rom in its place"):
+        trials.trials(again, "safety", "nav-hum", 0)
+
+
+def test_the_navigation_test_drives_the_rom_on_the_dev_episodes(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    test = navigation(here)
+    assert test.upstream[-1].name == "policy rom, seed 0"
+    assert test.upstream[-1].key == policy(here, "rom", 0).key
+    assert {"locomotion", "gait library"} <= {stage.name for stage in test.upstream}
+    assert [path.name for path in test.reads] == ["dev.json"]
+    assert test.outputs == ("navigation.json",)

@@ -249,6 +249,18 @@ def test_a_table_needs_one_of_its_arms(episode_rows) -> None:
     assert row(read_latex(formats.latex(lone)), "RoM $-$ Uniform") == ["--"] * 4
 
 
+def test_arms_that_the_paper_has_no_numbers_of_are_dashes_there(episode_rows) -> None:
+    mine = tables.Entry("mine", "Mine")
+    rom = tables.Entry("rom", "RoM")
+    columns = (tables.Column("sr_45", "SR@45", 1, max),)
+    bootstrap = Bootstrap(rows.pair([episode_rows("rom"), episode_rows("mine", 0.2)]), resamples=50)
+    performance = tables.build(tables.PerformanceSpec("own", "Own.", rom, ((rom, mine),), columns), bootstrap)
+    levels = tables.build(tables.LevelsSpec("own-levels", "Own.", rom, (mine,)), bootstrap)
+    for table in (performance, levels):
+        ours, paper_ = ([row.cells[0].text for row in b.rows] for b in table.blocks)
+        assert paper_[-1] == "–" != ours[-1]
+
+
 def test_every_arm_that_competes_has_published_numbers() -> None:
     for spec in tables.SPECS:
         arms = [entry.arm for entry in spec.entries if entry not in spec.bounds]

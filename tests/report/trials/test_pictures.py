@@ -32,6 +32,8 @@ def test_points_are_projected_to_where_the_image_shows_them() -> None:
 def test_figures_show_tracks_and_collisions(trial_run, tmp_path: Path) -> None:
     run = trial_run("rom", n=16)
     trial_pictures.draw_safety(run, obstacle_scenes(), tmp_path / "safety.png")
+    trial_pictures.draw_safety(trial_run("rom", n=4), obstacle_scenes(), tmp_path / "few.png")  # fewer than are shown
+    assert imread(tmp_path / "few.png").ndim == 3
     scenes = deployment_scenes()
     trial_pictures.draw_deployments(
         trial_run("rom", n=4, scenes=[scene.name for scene in scenes]), scenes, tmp_path / "deploy.png"
