@@ -43,7 +43,7 @@ class EvaluationSpec(Config):
     duration: float = 120.0
     """Longest episode, s (P); success within 45 s is read off the same episode."""
     reach: float = 0.5
-    """Distance to the goal that is success, in 3D, m (P)."""
+    """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""
     threads: int = 1
     """PyTorch threads (A: another number gives other bits)."""
 
@@ -56,7 +56,7 @@ class TrialSpec(Config):
     duration: float = Field(default=60.0, gt=0.0)
     """Longest trial, s (A: several times what the paper's trials took)."""
     reach: float = 0.5
-    """Distance to the goal that is success, in 3D, m (P)."""
+    """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""
     heading: float = Field(default=math.pi / 4, ge=0.0)
     """Largest angle at the start between heading and shortest path, rad (A)."""
     seed: int = Field(default=1000, ge=0)

@@ -65,15 +65,16 @@ class EnvSpec(Config):
     duration: float = 45.0
     """Longest episode, s (P)."""
     stay: float = 45.0
-    """An episode is truncated, not ended, this long after the goal was first reached, s (P: never, it runs on to
-    ``duration``; A: short runs use a few seconds and spend the steps on new goals)."""
+    """An episode is truncated, not ended, this long after the goal was first reached, s (A: never, as the paper
+    rewards standing on the goal; short runs use a few seconds and spend the steps on new goals)."""
     patience: float = 45.0
-    """An episode is truncated, not ended, after this long without coming nearer to the goal than ever before, s (P:
-    never; A: progress is measured along the shortest path, so short runs lose little by starting over)."""
+    """An episode is truncated, not ended, after this long without coming nearer to the goal than ever before, s (A:
+    never, as the paper names no such end; progress is measured along the shortest path, so short runs lose little by
+    starting over)."""
     reach: float = 0.5
-    """Distance in 3D that counts as arrival, m (P)."""
+    """Distance that counts as arrival, m (P, of evaluation; A: in 3D, or goals would be reached from other floors)."""
     max_goal_distance: float = 30.0
-    """d_max of the goal observation, m (P: the geodesic cap)."""
+    """d_max of the goal observation, m (A: the geodesic cap, beyond which no goal of training lies)."""
     command: CommandSpec = CommandSpec()
     reward: RewardSpec = RewardSpec()
     sampler: SamplerSpec = SamplerSpec()

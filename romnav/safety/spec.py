@@ -57,7 +57,7 @@ class FilterSpec(Config):
     alpha: float = Field(0.75, gt=0)
     """Decay rate of the barrier condition ``dh/dt >= -alpha h``, 1/s (P)."""
     period: float = Field(0.2, gt=0)
-    """Time for which a command is held, s (P: navigation at 5 Hz)."""
+    """Time for which a command is held, s (A: navigation's 5 Hz)."""
     retain: float = Field(0.5, gt=0, lt=1)
     """Share of h that must remain at every instant of that time (A: any share in (0, 1) keeps h positive;
     less than ``1 - alpha period``, so that it only acts where h is strongly curved)."""

@@ -13,7 +13,7 @@ class LidarSpec(Config):
     """Range image of a Livox Mid-360 in the head of a G1, binned after levelling (paper, Sec. III-A)."""
 
     rows: int = Field(default=59, ge=1)
-    """Pixels in elevation; 59 are 1 degree each (P)."""
+    """Pixels in elevation; 59 are 1 degree each (P: the degree; A: the number, from ``elevation``)."""
     columns: int = Field(default=220, ge=16)
     """Pixels in azimuth; 220 are 1 degree each (P). At least the width of a vector."""
     azimuth: float = Field(default=220.0, gt=0.0, le=360.0)
@@ -29,7 +29,7 @@ class LidarSpec(Config):
     min_range: float = Field(default=0.1, ge=0.0)
     """Nearest return, m (A: Mid-360 data sheet)."""
     max_range: float = Field(default=30.0, gt=0.0)
-    """Farthest return, m (A: beyond the 28 m diagonal of a tile)."""
+    """Farthest return, m (A: as far as goals of training lie; a Mid-360 sees surfaces of 10 % albedo at 40 m)."""
     backend: Literal["columns", "mesh"] = "columns"
     """"columns" intersects the solids in closed form; "mesh" casts rays at their triangles, as an oracle."""
 
@@ -59,7 +59,7 @@ class CorruptionSpec(Config):
     noise: tuple[float, float, float] = (0.02, 0.001, 0.0)
     """Standard deviation of a range r, ``n0 + n1 r + n2 r^2``, m (A: Mid-360 data sheet, 2 cm at 10 m)."""
     dropout: tuple[float, float] = (0.0, 0.8)
-    """Least and largest share of lost pixels; each image draws its own (P)."""
+    """Least and largest share of lost pixels (P; A: each image draws its own)."""
     occlusion: tuple[tuple[float, float, float, float], ...] = (
         (0.0, 0.1, 0.75, 1.0),
         (0.9, 1.0, 0.75, 1.0),
@@ -75,7 +75,8 @@ class EncoderSpec(Config):
     """Variational autoencoder of one range sensor."""
 
     cartesian: bool = True
-    """Whether x, y, z are channels and a head beside the range: LiDAR yes, depth camera no (P)."""
+    """Whether x, y, z are channels and a head beside the range: LiDAR yes (P), depth camera no (A: a pixel's place in
+    the image tells them)."""
     scale: float = Field(default=5.0, gt=0.0)
     """Length that becomes 1 in the channels and heads, m (A)."""
     widths: tuple[int, ...] = (16, 32, 64, 64)
@@ -98,7 +99,7 @@ class PretrainSpec(Config):
     images: int = Field(default=2_000_000, ge=1)
     """Images, half from uniform poses and half on or near stairs and ramps (P)."""
     epochs: int = Field(default=10, ge=1)
-    """Passes over the images, each with new corruption (P)."""
+    """Passes over the images (P; A: each with new corruption)."""
     batch: int = Field(default=32, ge=1)
     """Images per gradient step (A: steps, not images, limit short runs)."""
     learning_rate: float = 4e-3
@@ -135,7 +136,7 @@ class DepthEncoderSpec(EncoderSpec):
     """Variational autoencoder of the depth camera."""
 
     cartesian: bool = False
-    """Depth and validity alone (P)."""
+    """Depth and validity alone (A: the paper names the channels of the range image only)."""
     scale: float = Field(default=2.0, gt=0.0)
     """Length that becomes 1 in the channel and head, m (A)."""
     strides: tuple[tuple[int, int], ...] = ((2, 2), (2, 2), (2, 2), (2, 2))
@@ -161,4 +162,4 @@ class QualitySpec(Config):
     tiles: int = Field(default=64, ge=1)
     """Tiles (A)."""
     seed: int = Field(default=1000, ge=0)
-    """Seed of the tiles; training uses another (P)."""
+    """Seed of the tiles; training uses another (A: as the paper does for policies)."""
