@@ -120,7 +120,7 @@ class Job(AtScale):
         """Writes the reports that are out of date, or all without ``resume``, from what is recorded."""
         from romnav.experiment.graph import records, run
 
-        run.execute([r for r in reports if not self.resume or not records.finished(r)], self._session(), _say)
+        run.execute([r for r in reports if not self.resume or not records.drawn(r)], self._session(), _say)
 
     def _session(self) -> Session:
         from romnav.experiment.graph.stage import Session

@@ -66,9 +66,26 @@ def finished(stage: Stage) -> bool:
         RomnavError: An output is not the file that was recorded.
     """
     record = read(stage)
-    if record is None or record.key != stage.key or set(record.outputs) != set(stage.outputs):
+    if record is None or record.key != stage.key:
         return False
-    if not all((stage.folder / name).is_file() for name in stage.outputs):
+    return _whole(stage, record) and _read_what_is_there(stage, record)
+
+
+def drawn(stage: Stage) -> bool:
+    """Whether a report is there and shows what is recorded, be that up to date itself or not.
+
+    Raises:
+        RomnavError: As `finished`.
+    """
+    record = read(stage)
+    if record is None or record.spec != stage.spec or not _whole(stage, record):
+        return False
+    return record.upstream == {above.name: other.outputs for above in stage.upstream if (other := read(above))}
+
+
+def _whole(stage: Stage, record: Record) -> bool:
+    """Whether a stage's files are those that it recorded; none of them is another one."""
+    if set(record.outputs) != set(stage.outputs) or not all((stage.folder / name).is_file() for name in stage.outputs):
         return False
     for name, recorded in record.outputs.items():
         if digest(stage.folder / name) != recorded:
@@ -76,7 +93,7 @@ def finished(stage: Stage) -> bool:
                 f"{stage.folder / name}: not the file that {stage.record.name} recorded (truncated, edited); "
                 "restore it, or delete it to run the stage again"
             )
-    return _read_what_is_there(stage, record)
+    return True
 
 
 def _read_what_is_there(stage: Stage, record: Record) -> bool:

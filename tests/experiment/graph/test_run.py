@@ -288,3 +288,20 @@ def test_a_record_stays_as_it_is_when_the_same_comes_out(chain: list[Stage]) -> 
 def test_a_device_that_is_not_there_is_one_clear_error() -> None:
     with pytest.raises(RomnavError, match=r"device cdua: .*; use cpu, cuda or cuda:N"):
         Session("cdua")
+
+
+def test_a_report_is_drawn_again_when_what_it_shows_has_changed_and_not_before(chain: list[Stage]) -> None:
+    run(chain)
+    folder = chain[0].folder.parent
+    _, _, report = build(folder, (set(), {0}, {1}), Settings(a=1))
+    assert not records.finished(report)  # a is to be made again, and so are b and the report
+    assert records.drawn(report)  # but it shows the b that is there
+    *_, other = build(folder, (set(), {0}, {1}), Settings(c=1))
+    assert not records.drawn(other)
+    (chain[1].folder / "out.txt").write_text("made by another machine")
+    record = records.read(chain[1])
+    assert record is not None
+    records.finish(chain[1], record, {}, 0.0)
+    assert not records.drawn(chain[2])
+    (chain[2].folder / "out.txt").unlink()
+    assert not records.drawn(report)
