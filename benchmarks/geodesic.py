@@ -15,7 +15,7 @@ from collections.abc import Callable
 from math import gcd, hypot
 
 import numpy as np
-from _common import arguments, report, take_turns
+from _common import arguments, importable, report, take_turns
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -167,11 +167,12 @@ def main() -> None:
                 options.repeats,
             )
             agree &= shortest > -UNIT
-    compare(
-        "scikit-fmm, second order, one floor",
-        lambda: [np.stack([marching(g, i) for i in goal]) for g, goal in zip(tiles, few, strict=True)],
-        options.repeats,
-    )
+    if importable("skfmm"):
+        compare(
+            "scikit-fmm, second order, one floor",
+            lambda: [np.stack([marching(g, i) for i in goal]) for g, goal in zip(tiles, few, strict=True)],
+            options.repeats,
+        )
     text = f"{count} fields over {nodes} nodes on average, {len(tiles)} tiles of all classes; one core, CPU time"
     report(
         "geodesic",

@@ -13,6 +13,19 @@ from romnav.cli.options import AtScale, DeviceJob, SeedOption, arms, command
 from romnav.cli.printing import print_table
 from romnav.errors import RomnavError
 
+KEPT_COLUMNS = {
+    "arm": "arm",
+    "iteration": "iteration",
+    "steps": "steps",
+    "sr_45_all": "SR@45",
+    "sr_45_same": "same",
+    "sr_45_cross": "cross",
+    "sr_120_all": "SR@120",
+    "sr_120_same": "same",
+    "sr_120_cross": "cross",
+    "sr_120_storey": "storeys",
+    "spl": "SPL",
+}
 RESULT_COLUMNS = {
     "arm": "arm",
     "seed": "seed",
@@ -67,6 +80,9 @@ def evaluate(
         ),
     ],
     paired: Annotated[bool, typer.Option("--paired", help="Compare the arms episode by episode.")] = False,
+    along: Annotated[
+        bool, typer.Option("--kept", help="Judge what an arm's run has kept on the way, on the episodes for choices.")
+    ] = False,
     seed: SeedOption = None,
     navigation: Annotated[
         bool,
@@ -77,6 +93,9 @@ def evaluate(
     from romnav.experiment.graph.run import require
     from romnav.experiment.kinds.episodes import episodes
 
+    if along:
+        _judge_kept(job, names, seed)
+        return
     if navigation and "locomotion" not in names:
         raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
     if "locomotion" in names:
@@ -113,6 +132,16 @@ def check(at: AtScale) -> None:
     # bands belong to the project: --results is where the results of today lie
     bands = at.project.root / "results" / at.work.scale / "bands.json"
     typer.echo("\n".join(check(_collect(at), bands)))
+
+
+def _judge_kept(job: DeviceJob, names: list[str], seed: int | None) -> None:
+    from romnav.evaluation.paired.progress import read
+    from romnav.experiment.kinds.kept import kept
+
+    stages = [kept(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+    job.make(stages)
+    rows = [{"arm": stage.arm, **row} for stage in stages for row in read(stage.folder / stage.outputs[0])]
+    print_table("Success of kept policies in percent", rows, KEPT_COLUMNS)
 
 
 def _test_terrain(job: DeviceJob) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from romnav.cli.app import play
-from romnav.cli.options import AtScale, command
+from romnav.cli.options import ArmArgument, AtScale, command
 
 
 @command(play, "world")
@@ -37,3 +37,33 @@ def play_locomotion(at: AtScale) -> None:
     for path in strip(walked / "policy.pt", figures):
         typer.echo(path)
     typer.echo(curve(walked / "curve.csv", figures / "locomotion-curve.png"))
+
+
+@command(play, "episodes")
+def episodes(
+    at: AtScale,
+    arm: ArmArgument,
+    failed: Annotated[bool, typer.Option("--failed", help="Only episodes that did not reach the goal.")] = False,
+    where: Annotated[
+        str | None,
+        typer.Option(
+            help='Which, e.g. \'level == "cross" and climb > 3 and how == "pressed"\'; see the columns printed.'
+        ),
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="How many to draw at most.")] = 6,
+    seed: Annotated[int, typer.Option("--seed", help="Training seed.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
+) -> None:
+    """Draw maps of an arm's episodes: the way it went beside the shortest, on every layer; and count how it fails."""
+    from romnav.experiment.kinds.episodes import look_at
+
+    seen = look_at(at.work, arm, seed)
+    chosen = seen.choose(failed, where)
+    path = out or at.work.folder / "figures" / f"episodes-{arm}.png"
+    typer.echo(seen.failures().to_string())
+    if not len(chosen):
+        typer.echo("no episode is like that")
+        return
+    typer.echo(f"{len(chosen)} episodes: {', '.join(map(str, chosen[:20]))}{', ...' if len(chosen) > 20 else ''}")
+    seen.draw(chosen[:count], path)
+    typer.echo(path)

@@ -18,10 +18,8 @@ from romnav.evaluation.spec import EvaluationSpec
 from romnav.navigation.spec import EnvSpec
 from romnav.world.spawns import Start, is_cross_level, sample
 from romnav.world.spec import SamplerSpec
-from romnav.world.world import World
+from romnav.world.world import STOREY, TWO_STOREYS, World
 
-STOREY, TWO_STOREYS = 3.5, 7.5
-"""Least climb that counts as one storey and as two, m."""
 DRAWS, EPISODES = 20_000, 512
 """Draws of each sampler, and episodes of each scripted arm: shares are within a percent, rates within some."""
 

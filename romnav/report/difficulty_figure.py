@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from romnav.evaluation.difficulty import STOREY, TWO_STOREYS, Goals
+from romnav.evaluation.difficulty import Goals
+from romnav.world.world import STOREY, TWO_STOREYS
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 DASHES = ("-", "--", ":")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,19 +85,29 @@ class GaitLibrary:
         return min(found, key=lambda gait: abs(gait.slope - slope))
 
     def place(
-        self, control: Controller, ids: Tensor, gait: Gait, frame: Tensor, anchor: Tensor, heading: Tensor
+        self,
+        control: Controller,
+        ids: Tensor,
+        gaits: Sequence[Gait],
+        frame: Tensor,
+        anchor: Tensor,
+        heading: Tensor,
     ) -> None:
-        """Start robots `ids` within a gait.
+        """Start robots `ids` within gaits.
 
         Args:
             control: of the robots.
             ids: (k,).
-            gait: from `nearest`.
-            frame: (k,) times along it.
+            gaits: of each, from `nearest`.
+            frame: (k,) times along them.
             anchor: (k, 3) middle of the tread to stand on (of a ramp: any point of it), m.
             heading: (k,) of walking, rad.
         """
-        control.restore(ids, move({n: v[frame] for n, v in gait.frames.items()}, heading, anchor))
+        picked = {
+            name: torch.stack([gait.frames[name][k] for gait, k in zip(gaits, frame.tolist(), strict=True)])
+            for name in gaits[0].frames
+        }
+        control.restore(ids, move(picked, heading, anchor))
 
     def save(self, path: Path) -> None:
         """Write all gaits to one file."""
@@ -216,7 +227,7 @@ def still_up(
             x, z = slabs[0].x0 + part * (slabs[0].x1 - slabs[0].x0), slabs[0].z0 + part * (slabs[0].z1 - slabs[0].z0)
         gait = library.nearest(kind, direction, slope)
         anchor = torch.tensor([[x, float(ground.path[which, 0, 1]), z]])
-        library.place(control, i[None], gait, (when * len(gait)).long()[None], anchor, torch.zeros(1))
+        library.place(control, i[None], [gait], (when * len(gait)).long()[None], anchor, torch.zeros(1))
         lane[i], start[i] = which, x
     arc, forward, speed = start, torch.ones(trials), torch.full((trials,), COMMAND)
     fell = torch.zeros(trials, dtype=torch.bool)

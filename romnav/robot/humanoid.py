@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ from romnav import random
 from romnav.errors import RomnavError
 from romnav.robot.dynamics import Head
 from romnav.robot.g1 import HEAD, Humanoids, build_spec
-from romnav.robot.gaits import GaitLibrary
+from romnav.robot.gaits import Gait, GaitLibrary
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
 from romnav.robot.tiles import TileGeoms, TileHeights, change_layer
@@ -28,6 +28,16 @@ FOOTING = 0.35
 """Distance from the side of a stair or ramp within which nobody is put on it, m."""
 _CLOCK, _FRAME = range(2)
 _STATE = ("tile", "layer", "position", "yaw", "contacts", "fallen", "_env", "_resets", "_first")
+
+
+class _Slope(NamedTuple):
+    """A place to start on a stair or ramp: on the middle of a tread, along the flight."""
+
+    kind: str
+    direction: int
+    steepness: float
+    middle: tuple[float, float, float]
+    heading: float
 
 
 class Humanoid:
@@ -99,12 +109,25 @@ class Humanoid:
         self._enter_tiles()
         self._resets[envs] += 1
         z = self._under(envs, start)
+        at, heading = torch.cat([start.xy, z[:, None]], dim=1), start.yaw.clone()
+        walking: list[int] = []
+        gaits: list[Gait] = []
+        for k, tile in enumerate(start.tile.tolist()):
+            slope = self._slope(tile, start.xy[k].numpy(), float(z[k]), float(heading[k]))
+            if slope is None:
+                continue
+            at[k], heading[k] = torch.tensor(slope.middle), slope.heading
+            if self.gaits.has(slope.kind, slope.direction):
+                walking.append(k)
+                gaits.append(self.gaits.nearest(slope.kind, slope.direction, slope.steepness))
         clock = self._draw(envs, _CLOCK, 2) * self._spec.gait.step_ticks
-        still = torch.zeros(len(envs), 3)
-        self.control.stand(envs, torch.cat([start.xy, z[:, None]], dim=1), start.yaw, clock, still)
+        self.control.stand(envs, at, heading, clock, torch.zeros(len(envs), 3))
         self._first[envs] = True
-        for k in range(len(envs)):
-            self._put_on_slope(envs[k : k + 1], int(start.tile[k]), start.xy[k].numpy(), float(z[k]), start.yaw[k])
+        if walking:
+            ids = envs[walking]
+            frames = self._draw(ids, _FRAME, torch.tensor([len(gait) for gait in gaits]))
+            self.gaits.place(self.control, ids, gaits, frames, at[walking], heading[walking])
+            self._first[ids] = False
         self.contacts[envs], self.fallen[envs] = 0.0, False
         self._read()
 
@@ -115,36 +138,29 @@ class Humanoid:
         reach[envs] = self.world.surface(start.tile, start.layer, start.xy) + STEP_UP
         return self._heights(xy, reach)[envs]
 
-    def _draw(self, envs: Tensor, purpose: int, high: int) -> Tensor:
+    def _draw(self, envs: Tensor, purpose: int, high: int | Tensor) -> Tensor:
         return random.integers(high, self.seed, self._env[envs], self._resets[envs], purpose)
 
-    def _put_on_slope(self, env: Tensor, tile: int, xy: np.ndarray, z: float, yaw: Tensor) -> None:
-        """If the start is on a stair or ramp, walk there already: on the middle of a tread, along the flight."""
+    def _slope(self, tile: int, xy: np.ndarray, z: float, yaw: float) -> _Slope | None:
+        """Where to walk if a start (2,) on the surface `z` is on a stair or ramp; None where it is not."""
         solids = self.world.tiles[tile].solids
         (u,), (v,) = (part.T for part in solids.local(xy[None]))
         top = solids.top + solids.slope_top * u
         under = solids.walkable & (np.abs(u) <= solids.half[:, 0]) & (np.abs(v) <= solids.half[:, 1])
         under &= np.abs(top - z) < 0.02
         slope = under & np.isin(solids.label, (Label.STAIR, Label.RAMP))
-        found = self._flight(tile, xy, z)
-        if not slope.any() or found is None:
-            return
+        found = self._flight(tile, xy, z) if slope.any() else None
+        if found is None:
+            return None
         step, (along, steepness) = np.flatnonzero(slope)[0], found
         kind = "ramp" if solids.label[step] == Label.RAMP else "stair"
-        forward = 1.0 if np.cos(float(yaw) - along) >= 0 else -1.0
+        up = np.cos(yaw - along) >= 0
         side = max(solids.half[step, 1] - FOOTING, 0.0)
         at_u, at_v = (u[step] if kind == "ramp" else 0.0), np.clip(v[step], -side, side)
         c, s = np.cos(solids.yaw[step]), np.sin(solids.yaw[step])
         x, y = solids.centre[step] + at_u * np.array([c, s]) + at_v * np.array([-s, c])
-        anchor = torch.tensor([[x, y, solids.top[step] + solids.slope_top[step] * at_u]], dtype=torch.float32)
-        heading = torch.tensor([along if forward > 0 else along + np.pi], dtype=torch.float32)
-        if not self.gaits.has(kind, int(forward)):
-            clock = self._draw(env, _CLOCK, 2) * self._spec.gait.step_ticks
-            self.control.stand(env, anchor, heading, clock, torch.zeros(1, 3))
-            return
-        gait = self.gaits.nearest(kind, int(forward), steepness)
-        self.gaits.place(self.control, env, gait, self._draw(env, _FRAME, len(gait)), anchor, heading)
-        self._first[env] = False
+        middle = x, y, solids.top[step] + solids.slope_top[step] * at_u
+        return _Slope(kind, 1 if up else -1, steepness, middle, along if up else along + np.pi)
 
     def _flight(self, tile: int, xy: np.ndarray, z: float) -> tuple[float, float] | None:
         """Heading uphill, rad, and rise over run of the connector's piece that passes nearest to a point."""

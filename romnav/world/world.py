@@ -18,6 +18,8 @@ from romnav.world.tile import Tile
 
 LEVEL_GAP = 0.5
 """Heights further apart than this are different levels, m (A: above every curb, below every platform with stairs)."""
+STOREY, TWO_STOREYS = 3.5, 7.5
+"""Least climb that counts as one storey and as two, m."""
 MOUTH_RADIUS = 1.0
 """A spawn this near to the end of a stair or ramp is at its mouth, m (A)."""
 

@@ -9,7 +9,7 @@ from tests.cli.conftest import romnav
 
 def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> None:
     lines = romnav("list").stdout.splitlines()
-    named = [line.split(":")[0] for line in lines if not line.startswith(" ")]
-    assert named == sorted(file.stem for file in (evaluated / "experiments").glob("*.toml"))
+    files = [file.stem for file in sorted((evaluated / "experiments").glob("*.toml"))]
+    assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == files
     assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in lines]
     assert ["uniform-nocap", "UniformNoCap", "(RoM)"] in [line.split() for line in lines]

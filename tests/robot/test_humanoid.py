@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +147,24 @@ def test_a_start_on_a_stair_faces_along_it_on_the_middle_of_a_tread(world: World
     assert there.isnan() or abs(float(there) - float(z[0])) > 0.05, "up or down within half a metre"
 
 
+def test_starts_in_a_batch_are_those_of_one_robot_after_the_other(world: World, checkpoint: Path) -> None:
+    library = GaitLibrary.load(Path(__file__).parents[2] / "results/cpu/locomotion/gaits.pt")
+    stairs = world.spawn[world.spawn < world.node_start[1]]
+    nodes = torch.cat([stairs[torch.linspace(0, len(stairs) - 1, 8).long()], level_nodes(world, 2)])
+    start = starts(world, nodes, torch.linspace(-3.0, 3.0, 10))
+    batch, single = (Humanoid(world, 10, 0.2, checkpoint, library, threads=1) for _ in range(2))
+    batch.reset(torch.arange(10), start)
+    for k in range(10):
+        one = Start(**{field.name: getattr(start, field.name)[k : k + 1] for field in fields(start)})
+        single.reset(torch.tensor([k]), one)
+    assert 0 < int(batch._first.sum()) < 10, "some stand, some are in the middle of a walk"
+    assert torch.equal(batch._first, single._first)
+    for mine, theirs in zip(*(body.robots.state(torch.arange(10)) for body in (batch, single)), strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-6, rtol=0)
+    for name in ("clock", "foothold", "heading", "joints"):
+        torch.testing.assert_close(getattr(batch.control.walker, name), getattr(single.control.walker, name))
+
+
 def test_starts_jittered_within_stair_cells_stand_on_the_surface_under_them(world: World, checkpoint: Path) -> None:
     nodes = world.spawn[world.spawn < world.node_start[1]][:40]
     start = starts(world, nodes, torch.zeros(len(nodes)))
@@ -154,9 +172,9 @@ def test_starts_jittered_within_stair_cells_stand_on_the_surface_under_them(worl
     start = replace(start, xy=start.xy + jitter)
     solids, on_tread, met = world.tiles[0].solids, [], []
     body = robot(world, len(nodes), checkpoint)
-    monkey = body._put_on_slope
+    monkey = body._slope
     heights: list[float] = []
-    body._put_on_slope = lambda env, tile, xy, z, yaw: (heights.append(z), monkey(env, tile, xy, z, yaw))[1]  # type: ignore[method-assign]
+    body._slope = lambda tile, xy, z, yaw: (heights.append(z), monkey(tile, xy, z, yaw))[1]  # type: ignore[method-assign]
     body.reset(torch.arange(len(nodes)), start)
     for k, node in enumerate(nodes.tolist()):
         tops = [solids.top[i] for i in _over(solids, start.xy[k].numpy()) if solids.walkable[i]]

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
+
+if TYPE_CHECKING:
+    from romnav.report.paired.gallery import EpisodeGallery
 
 
 def episodes(work: Workspace, arm: str, seed: int) -> Stage:
@@ -20,7 +25,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         kind="episodes",
         name=f"episodes {arm}, seed {driven.seed}",
         folder=driven.folder,
-        outputs=("episodes.parquet",),
+        outputs=("episodes.parquet", "tracks.npz"),
         record=driven.folder / "episodes.json",
         settings=driven.settings,
         uses=("evaluation", *driven.uses),
@@ -41,13 +46,15 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
     from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import rows
     from romnav.evaluation.paired.run import run
+    from romnav.evaluation.tracks import Recorder, write
 
     work, settings, path = driven.work, driven.settings, _set(driven.work)
     paired = load(path)
     world = terrain(paired, path, work.project.worlds).to(session.device)
     robots = body(work, settings, driven.seed, session.device, settings.evaluation.threads)
     driver = driven.driver(world, session.device)
-    measured = run(driver, world, paired, settings.navigation.env, settings.evaluation, progress, robots)
+    recorder = Recorder()
+    measured = run(driver, world, paired, settings.navigation.env, settings.evaluation, progress, robots, recorder)
     count = len(paired)
     columns: dict[str, Any] = {
         "arm": [driven.arm] * count,
@@ -59,6 +66,31 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
         **{name: values for name, values in paired.columns.items() if name in rows.SCHEMA.names},
         **measured,
     }
-    made = rows.make(columns, driven.provenance(stage, paired.digest))
-    rows.write(stage.folder / "episodes.parquet", made)
+    provenance = driven.provenance(stage, paired.digest)
+    rows.write(stage.folder / "episodes.parquet", rows.make(columns, provenance))
+    source = {name: str(value) for name, value in provenance.model_dump().items()}
+    write(stage.folder / "tracks.npz", recorder.tracks(count), source)
     return {}
+
+
+def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
+    """The evaluated episodes of an arm with their tracks.
+
+    Raises:
+        RomnavError: They are missing or out of date.
+    """
+    from romnav.evaluation.episodes import load, terrain
+    from romnav.evaluation.paired import rows
+    from romnav.evaluation.tracks import read
+    from romnav.report.paired.gallery import EpisodeGallery
+
+    stage = episodes(work, arm, seed)
+    run, path = rows.read(stage.folder / "episodes.parquet"), _set(work)
+    paired = load(path)
+    if run.provenance.episode_set != paired.digest:
+        raise RomnavError(
+            f"{run.source}: rows of episode set {run.provenance.episode_set}, but {path} is {paired.digest}; "
+            f"run `romnav {shlex.join(stage.command)}`"
+        )
+    tracks, _ = read(stage.folder / "tracks.npz")
+    return EpisodeGallery(run, tracks, paired, terrain(paired, path, work.project.worlds))

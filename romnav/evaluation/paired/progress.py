@@ -1,0 +1,48 @@
+"""Progress along a run: success of the policies kept on the way, one row each."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from romnav.evaluation.paired.metrics import LEVELS, evaluate
+from romnav.world.world import STOREY
+
+COLUMNS = (
+    *("policy", "episodes", "iteration", "steps", "hours"),
+    *(f"sr_{horizon}_{level}" for horizon in (45, 120) for level in (*LEVELS, "storey")),
+    *("spl", "t2g"),
+)
+"""Digests of policy and episode set, place in the run, success rates in percent by level and over climbs of a storey
+or more, SPL, and time to goal in s."""
+
+
+def row(columns: Mapping[str, NDArray]) -> dict[str, float]:
+    """What the episode rows of a kept policy say, from ``sr_45_all`` on."""
+    climbs = np.abs(columns["goal_z"] - columns["spawn_z"]) >= STOREY
+    by_level: dict[str, dict[str, float]] = {level: evaluate(columns, level) for level in LEVELS}
+    by_level["storey"] = evaluate({name: values[climbs] for name, values in columns.items()})
+    rates = {f"sr_{h}_{level}": values[f"sr_{h}"] for level, values in by_level.items() for h in (45, 120)}
+    return rates | {name: by_level["all"][name] for name in ("spl", "t2g")}
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Rows of an earlier judgement; none where there is no such file, or one with other columns."""
+    if not path.exists():
+        return []
+    reader = csv.DictReader(io.StringIO(path.read_text("utf-8")))
+    return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
+
+
+def text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Rows as a file."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    return out.getvalue()

@@ -1,0 +1,86 @@
+"""The policies kept along a run, judged on the episodes for choices: progress that training itself cannot show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from romnav import files
+from romnav.errors import RomnavError
+from romnav.experiment.graph.stage import Session, Stage, digest
+from romnav.experiment.kinds._driven import NOISE
+from romnav.experiment.kinds.locomotion import body
+from romnav.experiment.kinds.policy import perception, policy
+from romnav.experiment.workspace import Workspace
+from romnav.progress import Progress
+
+EPISODES = "dev"
+"""The set for choices; the one that tables are made of is not looked at on the way."""
+
+
+def kept(work: Workspace, arm: str, seed: int) -> Stage:
+    """Success of every policy kept so far along the run of a trained arm, which need not have ended.
+
+    Raises:
+        RomnavError: The run has kept none.
+    """
+    trained = policy(work, arm, seed)
+    policies = tuple(sorted((trained.folder / "kept").glob("*.pt")))
+    if not policies:
+        raise RomnavError(
+            f"{trained.folder / 'kept'}: no policies along the run; train with navigation.ppo.keep set, and look again"
+        )
+    return Stage(
+        kind="kept",
+        name=f"kept policies of {trained.arm}, seed {seed}",
+        folder=trained.folder,
+        outputs=("kept.csv",),
+        record=trained.folder / "kept.json",
+        settings=trained.settings,
+        uses=("evaluation",),
+        make=partial(_judge, work, trained, policies),
+        reads=(work.project.root / "experiments" / "episodes" / f"{EPISODES}.json", *policies),
+        upstream=tuple(above for above in trained.upstream if above.kind != "policy"),
+        command=work.command("eval", str(trained.arm), "--kept", "--seed", str(seed)),
+        arm=trained.arm,
+        seed=seed,
+    )
+
+
+def _judge(
+    work: Workspace, trained: Stage, policies: tuple[Path, ...], stage: Stage, session: Session, progress: Progress
+) -> dict[str, Any]:
+    """Those that were judged before are not walked again."""
+    from romnav.evaluation.episodes import load, terrain
+    from romnav.evaluation.paired import progress as along
+    from romnav.evaluation.paired.run import run
+    from romnav.evaluation.rollout import Policy
+    from romnav.navigation import checkpoint
+
+    settings, path = work.arm_settings(str(trained.arm)), stage.reads[0]
+    episodes = load(path)
+    world = terrain(episodes, path, work.project.worlds).to(session.device)
+    seen = perception(work, trained, settings, world, noise=NOISE, device=session.device)
+    depth = seen.depth.encoder if seen.depth else None
+    before = {(row["policy"], row["episodes"]): row for row in along.read(stage.folder / "kept.csv")}
+    columns = {**episodes.columns, "level": np.where(episodes.cross, "cross", "same")}
+    rows: list[Mapping[str, Any]] = []
+    for file in policies:
+        name = digest(file)[:16], episodes.digest
+        if name in before:
+            rows.append(before[name])
+            continue
+        driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
+        robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
+        measured = run(driver, world, episodes, settings.navigation.env, settings.evaluation, progress, robots)
+        saved = checkpoint.read(file)
+        place = {"policy": name[0], "episodes": name[1], "iteration": int(file.stem)}
+        place |= {"steps": saved["steps"], "hours": saved["hours"]}
+        rows.append(place | along.row(columns | measured))
+        files.write(stage.folder / "kept.csv", along.text(rows))
+    files.write(stage.folder / "kept.csv", along.text(rows))
+    return {"policies": len(policies)}

@@ -1,0 +1,92 @@
+"""Policies kept along a run are judged once each, on the episodes for choices."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from romnav.errors import RomnavError
+from romnav.evaluation import episodes
+from romnav.evaluation.paired.progress import read
+from romnav.evaluation.spec import EpisodeSetSpec
+from romnav.experiment.graph.stage import Session
+from romnav.experiment.kinds import kept as module
+from romnav.experiment.kinds.kept import kept
+from romnav.experiment.workspace import Workspace
+from romnav.navigation import checkpoint
+from romnav.navigation.ppo import make_actor
+from romnav.world.build import build
+from romnav.world.spec import SamplerSpec, WorldSpec
+from tests.experiment import conftest
+from tests.navigation.conftest import TOKENS, FakePerception
+
+ROOT = Path(__file__).parents[3]
+SCALE = """
+[world]
+tiles = 4
+[evaluation]
+duration = 4.0
+[navigation.policy]
+attention = 16
+recurrent = 16
+"""
+
+
+def policy(file: Path, work: Workspace, seed: int) -> None:
+    torch.manual_seed(seed)
+    navigation = work.arm_settings("rom").navigation
+    obs = TensorDict({"lidar": torch.zeros(1, *TOKENS), "state": torch.zeros(1, 9)}, batch_size=[1])
+    actor = make_actor(obs, navigation.policy)
+    made = {"spec": navigation.model_dump_json(), "encoder": FakePerception().encoder.digest()}
+    checkpoint.save(file, {**made, "actor": actor.state_dict(), "steps": 100 * seed, "hours": 0.1})
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Workspace:
+    (tmp_path / "experiments" / "episodes").mkdir(parents=True)
+    shutil.copy(ROOT / "experiments" / "spawn-goal.toml", tmp_path / "experiments")
+    spec = EpisodeSetSpec(
+        world=WorldSpec(tiles=2, seed=54, goals_per_tile=8),
+        episodes=8,
+        cross=4,
+        sampler=SamplerSpec(stair_probability=0.0),
+    )
+    episodes.save(tmp_path / "experiments" / "episodes" / "dev.json", episodes.draw("dev", spec, build(spec.world)))
+    return conftest.workspace(tmp_path, SCALE)
+
+
+def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RomnavError, match=r"kept: no policies along the run; train with navigation\.ppo\.keep"):
+        kept(work, "rom", 0)
+    walked: list[int] = []
+
+    def perception(*_: Any, **__: Any) -> FakePerception:
+        return FakePerception()
+
+    def progress(done: int, total: int, text: str) -> None:
+        walked.append(done)
+
+    monkeypatch.setattr(module, "perception", perception)
+    folder = work.folder / "rom" / "seed-0"
+    policy(folder / "kept" / "000002.pt", work, 1)
+    first = kept(work, "rom", 0)
+    first.make(first, Session(), progress)
+    once = len(walked)
+    assert once > 0
+    policy(folder / "kept" / "000004.pt", work, 2)
+    second = kept(work, "rom", 0)
+    assert second.key != first.key
+    second.make(second, Session(), progress)
+    assert len(walked) == 2 * once
+    rows = read(folder / "kept.csv")
+    assert [(row["iteration"], row["steps"]) for row in rows] == [("2", "100"), ("4", "200")]
+    for row in rows:
+        for level in ("all", "same", "cross", "storey"):
+            assert 0.0 <= float(row[f"sr_45_{level}"]) <= float(row[f"sr_120_{level}"]) <= 100.0
+        whole = (float(row["sr_120_same"]) + float(row["sr_120_cross"])) / 2
+        assert float(row["sr_120_all"]) == pytest.approx(whole)
