@@ -66,21 +66,21 @@ def _judge(
     world = terrain(episodes, path, work.project.worlds).to(session.device)
     seen = perception(work, trained, settings, world, noise=NOISE, device=session.device)
     depth = seen.depth.encoder if seen.depth else None
-    before = {(row["policy"], row["episodes"]): row for row in along.read(stage.folder / "kept.csv")}
+    # policies that are gone keep their rows
+    rows: dict[str, Mapping[str, Any]] = {
+        row["policy"]: row for row in along.read(stage.folder / "kept.csv") if row["episodes"] == episodes.digest
+    }
     columns = {**episodes.columns, "level": np.where(episodes.cross, "cross", "same")}
-    rows: list[Mapping[str, Any]] = []
     for file in policies:
-        name = digest(file)[:16], episodes.digest
-        if name in before:
-            rows.append(before[name])
+        name = digest(file)[:16]
+        if name in rows:
             continue
         driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
         robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
         measured = run(driver, world, episodes, settings.navigation.env, settings.evaluation, progress, robots)
         saved = checkpoint.read(file)
-        place = {"policy": name[0], "episodes": name[1], "iteration": int(file.stem)}
+        place = {"policy": name, "episodes": episodes.digest, "iteration": int(file.stem)}
         place |= {"steps": saved["steps"], "hours": saved["hours"]}
-        rows.append(place | along.row(columns | measured))
-        files.write(stage.folder / "kept.csv", along.text(rows))
-    files.write(stage.folder / "kept.csv", along.text(rows))
+        rows[name] = place | along.row(columns | measured)
+        files.write(stage.folder / "kept.csv", along.text(list(rows.values())))
     return {"policies": len(policies)}

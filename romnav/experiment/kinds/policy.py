@@ -50,7 +50,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         uses=tuple(uses),
         make=partial(_train, work, settings),
         upstream=(*encoders.values(), *teacher, *walking(work, settings)),
-        scratch=("checkpoint.pt", "curve.csv"),
+        scratch=("checkpoint.pt", "curve.csv", "kept.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
         arm=arm,
         seed=seed,

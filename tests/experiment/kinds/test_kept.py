@@ -78,6 +78,7 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     first.make(first, Session(), progress)
     once = len(walked)
     assert once > 0
+    (folder / "kept" / "000002.pt").unlink()
     policy(folder / "kept" / "000004.pt", work, 2)
     second = kept(work, "rom", 0)
     assert second.key != first.key
