@@ -31,6 +31,8 @@ def test_trials_are_reported_from_their_rows(project: Path, trial_run: Callable[
     for name in ("tables/safety.tex", "tables/safety.md", "tables/safety.csv", "figures/safety.png"):
         assert (folder / name).stat().st_size > 500
     assert not (folder / "tables" / "deploy.md").exists()
+    # scripted arms that were driven on the reduced-order model say nothing of the humanoid
+    assert not (folder / "tables" / "safety-hum.md").exists()
 
 
 def test_tables_are_made_of_rows_alone(evaluated: Path) -> None:

@@ -79,12 +79,14 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
-    """Table and figure of an experiment that consists of trials, its arms beside the scripted ones."""
+    """Table and figure of an experiment that consists of trials, its arms beside the scripted ones on the same body."""
     experiment = work.project.experiment(name)
     if experiment.kind == "ablation":
         return []
     kind = experiment.kind
-    arms = [*((arm, seed) for arm in experiment.arms for seed in seeds), *((arm, 0) for arm in SCRIPTED)]
+    rolls = any(work.arm_settings(arm).navigation.dynamics == "rom" for arm in experiment.arms)
+    bounds = [(arm, 0) for arm in SCRIPTED if rolls]
+    arms = [*((arm, seed) for arm in experiment.arms for seed in seeds), *bounds]
     return [
         Stage(
             kind="report",
