@@ -15,8 +15,7 @@ from romnav.errors import RomnavError
 
 KEPT_COLUMNS = {
     "arm": "arm",
-    "iteration": "iteration",
-    "steps": "steps",
+    "M steps": "M steps",
     "sr_45_all": "SR@45",
     "sr_45_same": "same",
     "sr_45_cross": "cross",
@@ -140,7 +139,15 @@ def _judge_kept(job: DeviceJob, names: list[str], seed: int | None) -> None:
 
     stages = [kept(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
     job.make(stages)
-    rows = [{"arm": stage.arm, **row} for stage in stages for row in read(stage.folder / stage.outputs[0])]
+    rows = [
+        {
+            "arm": stage.arm,
+            "M steps": float(row["steps"]) / 1e6,
+            **{key: float(row[key]) for key in KEPT_COLUMNS if key in row},
+        }
+        for stage in stages
+        for row in read(stage.folder / stage.outputs[0])
+    ]
     print_table("Success of kept policies in percent", rows, KEPT_COLUMNS)
 
 
