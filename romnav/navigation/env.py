@@ -84,7 +84,7 @@ class NavigationEnv(VecEnv):
         self._geodesic = torch.zeros(count, device=device)
         self._direction = torch.zeros(count, 2, device=device)
         self._finished = torch.zeros(4, dtype=torch.float64, device=device)
-        self._reward_sums = torch.zeros(8, dtype=torch.float64, device=device)
+        self._reward_sums = torch.zeros(len(weights(spec.reward, 0.0)), dtype=torch.float64, device=device)
         self._reward_steps = 0
         self._reset(self._env)
         # spread over the episode: environments that all end at once make every rollout a different task

@@ -32,7 +32,7 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             uses=("title", "labels"),
             make=partial(_draw, work, experiment),
             upstream=tuple(
-                policy(work, name, seed) for name, arm in experiment.arms.items() if not arm.policy for seed in seeds
+                policy(work, name, seed) for name, arm in experiment.arms.items() if arm.trained for seed in seeds
             ),
         )
     ]

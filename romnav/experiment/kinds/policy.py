@@ -60,7 +60,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
 def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
     project = work.project
     key = f"{project.file(project.having(arm)[0])}: arms.{arm}.kickstart.teacher"
-    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if not spec.policy}
+    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if spec.trained}
     if teacher not in trained:
         raise RomnavError(f"{key}: no arm {teacher} that is trained{suggest(teacher, trained)}")
     if work.arm_settings(teacher).kickstart:
