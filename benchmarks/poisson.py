@@ -25,7 +25,8 @@ from _common import arguments, importable, report, take_turns
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu, spsolve
 
-from romnav.safety.filter import SafetyFilter, cbf_qp, filter_velocity
+from romnav.safety.barrier import cbf_qp, filter_velocity
+from romnav.safety.filter import SafetyFilter
 from romnav.safety.occupancy import Rasterizer
 from romnav.safety.poisson import PoissonSolver
 from romnav.safety.spec import FilterSpec, SafetySpec

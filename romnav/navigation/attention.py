@@ -6,15 +6,13 @@ Library kernels are made for long sequences; among ten tokens of eight channels 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from romnav.kernels import wp
+from romnav.kernels import over_threads, wp
 
 wp.set_module_options(
     {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": "-march=native -ffast-math -w"}
@@ -100,15 +98,7 @@ def _launch(kernel: Any, share: Tensor, *vectors: Tensor) -> None:
         stream = wp.stream_from_torch(share.device) if share.is_cuda else None
         wp.launch(of_width, (part.stop - part.start, heads), inputs, device=device, stream=stream)
 
-    threads = 1 if share.is_cuda else torch.get_num_threads()
-    bounds = [batch * k // threads for k in range(threads + 1)]
-    parts = [slice(a, b) for a, b in pairwise(bounds)]
-    if threads == 1:
-        run(parts[0])
-    else:
-        # a launch on the CPU runs on one thread, but releases the interpreter's lock
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, parts))
+    over_threads(run, batch, device)
 
 
 class Attend(torch.autograd.Function):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, overload
 
 import numpy as np
 import torch
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from romnav.kernels import wp
 from romnav.sensing import columns
+from romnav.sensing.sensor import Sensor
 from romnav.sensing.spec import DepthSpec
 from romnav.world.solids import Solids
 
@@ -124,7 +123,7 @@ def _cast(
                 labels[env, row, column] = wp.int8(-1)
 
 
-class DepthCamera:
+class DepthCamera(Sensor):
     """The depth camera of every environment over a fixed set of tiles.
 
     A pinhole camera, fixed to the torso; each pixel is one ray through its centre and holds the depth along
@@ -136,6 +135,7 @@ class DepthCamera:
         device: Where to compute, "cpu" or "cuda".
     """
 
+    spec: DepthSpec
     directions: Tensor
     """(rows, columns, 3), torso frame (x forward, y left, z up): a pixel's point is ``depth * direction``."""
 
@@ -153,77 +153,23 @@ class DepthCamera:
         packed = np.concatenate([columns.pack(s) for s in solids])
         self._solids = wp.array(packed, dtype=columns.Solid, device=device)
         self._first = wp.array(np.cumsum([0, *map(len, solids)]), dtype=wp.int32, device=device)
+        wp.load_module(device=device)
 
-    @overload
-    def scan(
-        self,
-        tile: Tensor,
-        origin: Tensor,
-        yaw: Tensor,
-        *,
-        labels: Literal[False] = ...,
-        tilt: Tensor | None = ...,
-    ) -> Tensor: ...
-
-    @overload
-    def scan(
-        self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: Literal[True], tilt: Tensor | None = ...
-    ) -> tuple[Tensor, Tensor]: ...
-
-    def scan(
-        self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: bool = False, tilt: Tensor | None = None
-    ) -> Tensor | tuple[Tensor, Tensor]:
-        """Measure the depth images, without noise.
-
-        Args:
-            tile: (E,) int32, tile of each environment.
-            origin: (E, 3) float32, camera centre in the tile frame, m.
-            yaw: (E,) float32, heading of the torso, rad.
-            labels: Whether to return the `romnav.world.solids.Label` of each return as well.
-            tilt: (E, 2) float32, roll and pitch of the torso, rad; None if upright.
-
-        Returns:
-            (E, rows, columns) float32 depths in m, 0 where there is no return; with ``labels`` also
-            (E, rows, columns) int8, -1 where there is no return.
-        """
-        shape = (len(tile), self.spec.rows, self.spec.columns)
-        depth = torch.empty(shape, device=self.device)
-        classes = torch.empty(shape, dtype=torch.int8, device=self.device) if labels else None
-        pose = (tile.int().contiguous(), origin.float().contiguous(), _rotation(yaw.float(), tilt))
-        types = (wp.int32, wp.vec3, wp.mat33)
+    def _launch(self, pose: list[Tensor], ranges: Tensor, labels: Tensor | None) -> None:
+        limits = wp.vec2(self.spec.min_range, self.spec.max_range)
+        inputs = [self._solids, self._first, self._rays, limits, self._reach]
+        inputs += [wp.from_torch(x, dtype=t) for x, t in zip(pose, (wp.int32, wp.vec3, wp.mat33), strict=True)]
+        inputs += [wp.from_torch(ranges), None if labels is None else wp.from_torch(labels)]
         stream = None if self.device == "cpu" else wp.stream_from_torch(torch.device(self.device))
+        wp.launch(_cast, ranges.shape[:2], inputs, device=self.device, stream=stream)
 
-        def launch(part: slice) -> None:
-            inputs = [
-                self._solids,
-                self._first,
-                self._rays,
-                wp.vec2(self.spec.min_range, self.spec.max_range),
-            ]
-            inputs += [
-                self._reach,
-                *(wp.from_torch(x[part], dtype=t) for x, t in zip(pose, types, strict=True)),
-            ]
-            out = [wp.from_torch(depth[part]), None if classes is None else wp.from_torch(classes[part])]
-            size = (part.stop - part.start, self.spec.rows)
-            wp.launch(_cast, size, [*inputs, *out], device=self.device, stream=stream)
-
-        # a launch on the CPU runs on one thread, but releases the interpreter's lock
-        threads = torch.get_num_threads() if self.device == "cpu" else 1
-        bounds = np.linspace(0, len(tile), threads + 1).astype(int).tolist()
-        wp.load_module(device=self.device)
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(launch, map(slice, bounds[:-1], bounds[1:])))
-        return depth if classes is None else (depth, classes)
-
-
-def _rotation(yaw: Tensor, tilt: Tensor | None) -> Tensor:
-    """(E, 3, 3) from the torso to the tile frame, by yaw, then pitch, then roll."""
-    roll, pitch = (torch.zeros(len(yaw), 2, device=yaw.device) if tilt is None else tilt.float()).unbind(1)
-    (cy, cp, cr), (sy, sp, sr) = ([f(a) for a in (yaw, pitch, roll)] for f in (torch.cos, torch.sin))
-    rows = [
-        torch.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], 1),
-        torch.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], 1),
-        torch.stack([-sp, cp * sr, cp * cr], 1),
-    ]
-    return torch.stack(rows, 1).contiguous()
+    def _orientation(self, yaw: Tensor, tilt: Tensor) -> tuple[Tensor, ...]:
+        """Rotation (E, 3, 3) from the torso to the tile frame, by yaw, then pitch, then roll."""
+        roll, pitch = tilt.unbind(1)
+        (cy, cp, cr), (sy, sp, sr) = ([f(a) for a in (yaw, pitch, roll)] for f in (torch.cos, torch.sin))
+        rows = [
+            torch.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], 1),
+            torch.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], 1),
+            torch.stack([-sp, cp * sr, cp * cr], 1),
+        ]
+        return (torch.stack(rows, 1).contiguous(),)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal, overload
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,12 +13,13 @@ from torch import Tensor
 
 from romnav.kernels import wp
 from romnav.sensing import columns, visibility
+from romnav.sensing.sensor import Sensor
 from romnav.sensing.spec import LidarSpec
 from romnav.world.mesh import triangulate
 from romnav.world.solids import Solids
 
 
-class Lidar:
+class Lidar(Sensor):
     """The LiDAR of every environment over a fixed set of tiles.
 
     The image is levelled: its rows are elevations from the top edge down, its columns azimuths from the left
@@ -36,8 +36,10 @@ class Lidar:
         cache: Folder where the lists of what can be seen from where are kept, which take long to make.
     """
 
+    spec: LidarSpec
     directions: Tensor
     """(rows, columns, 3) unit vectors in the levelled LiDAR frame (x forward, y left, z up)."""
+    _label_type: ClassVar[torch.dtype] = torch.float32  # as the ranges, in whose vectors the kernel keeps them
 
     def __init__(
         self, solids: Sequence[Solids], spec: LidarSpec, device: str = "cpu", cache: Path | None = None
@@ -89,76 +91,28 @@ class Lidar:
             self._scene = [wp.array(packed, dtype=columns.Solid, device=device), places]
         wp.load_module(columns, device=device)
 
-    @overload
-    def scan(
-        self,
-        tile: Tensor,
-        origin: Tensor,
-        yaw: Tensor,
-        *,
-        labels: Literal[False] = ...,
-        tilt: Tensor | None = ...,
-    ) -> Tensor: ...
-
-    @overload
-    def scan(
-        self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: Literal[True], tilt: Tensor | None = ...
-    ) -> tuple[Tensor, Tensor]: ...
-
-    def scan(
-        self, tile: Tensor, origin: Tensor, yaw: Tensor, *, labels: bool = False, tilt: Tensor | None = None
-    ) -> Tensor | tuple[Tensor, Tensor]:
-        """Measure the range images, without noise.
-
-        Args:
-            tile: (E,) int32, tile of each environment.
-            origin: (E, 3) float32, LiDAR centre in the tile frame, m.
-            yaw: (E,) float32, heading of the image's centre, rad.
-            labels: Whether to return the `romnav.world.solids.Label` of each return as well.
-            tilt: (E, 2) float32, roll and pitch of the torso that carries the sensor, rad; None if upright.
-
-        Returns:
-            (E, rows, columns) float32 ranges in m, 0 where there is no return; with ``labels`` also
-            (E, rows, columns) int8, -1 where there is no return.
-        """
-        count = len(tile)
-        ranges = torch.empty(count, self.spec.rows, self.spec.columns, device=self.device)
-        classes = torch.full_like(ranges, -1.0) if labels else None
-        pose = tile.int().contiguous(), origin.float().contiguous(), yaw.float().contiguous()
-        axis = self._axis(count, tilt)
-
-        def launch(part: slice) -> None:
-            self._launch(*(x[part] for x in pose), axis[part], ranges[part], None if classes is None else classes[part])
-
-        # a launch on the CPU runs on one thread, but releases the interpreter's lock
-        threads = torch.get_num_threads() if self.device == "cpu" else 1
-        bounds = np.linspace(0, count, threads + 1).astype(int).tolist()
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(launch, map(slice, bounds[:-1], bounds[1:])))
-        return ranges if classes is None else (ranges, classes.to(torch.int8))
-
-    def _launch(
-        self, tile: Tensor, origin: Tensor, yaw: Tensor, axis: Tensor, ranges: Tensor, labels: Tensor | None
-    ) -> None:
+    def _launch(self, pose: list[Tensor], ranges: Tensor, labels: Tensor | None) -> None:
         count, rows, width = ranges.shape
-        pose = [wp.from_torch(tile), wp.from_torch(origin, dtype=wp.vec3), wp.from_torch(yaw)]
+        tile, origin, yaw, axis = pose
+        where = [wp.from_torch(tile), wp.from_torch(origin, dtype=wp.vec3), wp.from_torch(yaw)]
         mount = wp.from_torch(axis, dtype=wp.vec3)
         vectors = [columns.lanes(ranges), None if labels is None else columns.lanes(labels)]
         stream = None if self.device == "cpu" else wp.stream_from_torch(torch.device(self.device))
         if self.spec.backend == "mesh":
             meshes, first, label, directions = self._scene
             out = [wp.from_torch(ranges), None if labels is None else wp.from_torch(labels)]
-            inputs = [meshes, first, label, directions, self.spec.max_range, *pose, *out]
+            inputs = [meshes, first, label, directions, self.spec.max_range, *where, *out]
             wp.launch(columns.cast_rays, (count, rows, width), inputs, device=self.device, stream=stream)
             wp.launch(columns.finish, count, [self._image, mount, *vectors], device=self.device, stream=stream)
         else:
             sectors = 1 if self.device == "cpu" else width // columns.LANES
-            inputs = [*self._scene, self._image, sectors, *pose, mount, *vectors]
+            inputs = [*self._scene, self._image, sectors, *where, mount, *vectors]
             wp.launch(columns.draw_columns, (count, sectors), inputs, device=self.device, stream=stream)
 
-    def _axis(self, count: int, tilt: Tensor | None) -> Tensor:
-        """(E, 3) the sensor's own z axis in the levelled frame: upside down, it points to the ground."""
-        roll, pitch = (torch.zeros(count, 2, device=self.device) if tilt is None else tilt.float()).unbind(1)
+    def _orientation(self, yaw: Tensor, tilt: Tensor) -> tuple[Tensor, ...]:
+        """Heading and the sensor's own z axis (E, 3) in the levelled frame: upside down, it points to the ground."""
+        roll, pitch = tilt.unbind(1)
         x, z = -math.sin(self.spec.mount_pitch), -math.cos(self.spec.mount_pitch)
         up = roll.cos() * z
-        return torch.stack([pitch.cos() * x + pitch.sin() * up, -roll.sin() * z, pitch.cos() * up - pitch.sin() * x], 1)
+        axis = [pitch.cos() * x + pitch.sin() * up, -roll.sin() * z, pitch.cos() * up - pitch.sin() * x]
+        return yaw.contiguous(), torch.stack(axis, 1)

@@ -28,7 +28,8 @@ from romnav.robot.arms import OwnArms
 from romnav.robot.body import BodyModel
 from romnav.robot.dynamics import Dynamics
 from romnav.robot.spec import RobotSpec
-from romnav.safety.filter import Filtered, SafetyFilter, Status
+from romnav.safety.barrier import Filtered, Status
+from romnav.safety.filter import SafetyFilter
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.lidar import Lidar
 from romnav.threads import torch_threads

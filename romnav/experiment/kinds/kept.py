@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,43 @@ def kept(work: Workspace, arm: str, seed: int) -> Stage:
         arm=trained.arm,
         seed=seed,
     )
+
+
+def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
+    """The progress of the trained arms of an experiment, as a figure, where any was judged along its run."""
+    experiment = work.project.experiment(name)
+    judged = {
+        label: tuple(path for seed in seeds if (path := work.folder / arm / f"seed-{seed}" / "kept.csv").exists())
+        for arm, label in experiment.labels.items()
+    }
+    judged = {label: paths for label, paths in judged.items() if paths}
+    if not judged:
+        return []
+    return [
+        Stage(
+            kind="progress",
+            name=f"progress {name}",
+            folder=work.folder,
+            outputs=(f"figures/{name}-progress.png",),
+            record=work.folder / "figures" / f"{name}-progress.json",
+            settings=experiment,
+            uses=("labels",),
+            make=partial(_draw, judged),
+            reads=tuple(path for paths in judged.values() for path in paths),
+        )
+    ]
+
+
+def _draw(judged: Mapping[str, tuple[Path, ...]], stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    """Of the mean over training seeds at each number of steps."""
+    import pandas as pd
+
+    from romnav.report.paired.progress import draw
+
+    frames = {label: pd.concat([pd.read_csv(path) for path in paths]) for label, paths in judged.items()}
+    means = {label: frame.groupby("steps", as_index=False).mean(numeric_only=True) for label, frame in frames.items()}
+    draw(means, stage.folder / stage.outputs[0])
+    return {}
 
 
 def _judge(

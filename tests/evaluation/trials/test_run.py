@@ -11,7 +11,7 @@ from romnav.navigation.spec import EnvSpec
 from romnav.robot.body import BodyModel
 from romnav.robot.dynamics import Head
 from romnav.robot.rom import ReducedOrderModel
-from romnav.safety.filter import Status
+from romnav.safety.barrier import Status
 from romnav.sensing.spec import LidarSpec
 from romnav.world.scenes.obstacles import obstacle_scenes
 from romnav.world.scenes.scene import Scene, scene_world

@@ -16,7 +16,7 @@ from romnav.evaluation.paired.progress import read
 from romnav.evaluation.spec import EpisodeSetSpec
 from romnav.experiment.graph.stage import Session
 from romnav.experiment.kinds import kept as module
-from romnav.experiment.kinds.kept import kept
+from romnav.experiment.kinds.kept import kept, reports
 from romnav.experiment.workspace import Workspace
 from romnav.navigation import checkpoint
 from romnav.navigation.ppo import make_actor
@@ -61,6 +61,7 @@ def work(tmp_path: Path) -> Workspace:
 
 
 def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not reports(work, "spawn-goal", [0])
     with pytest.raises(RomnavError, match=r"kept: no policies along the run; train with navigation\.ppo\.keep"):
         kept(work, "rom", 0)
     walked: list[int] = []
@@ -84,6 +85,10 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     assert second.key != first.key
     second.make(second, Session(), progress)
     assert len(walked) == 2 * once
+    (figure,) = reports(work, "spawn-goal", [0])
+    assert [path.parts[-3:-1] for path in figure.reads] == [("rom", "seed-0")]
+    figure.make(figure, Session(), progress)
+    assert (work.folder / "figures" / "spawn-goal-progress.png").stat().st_size > 10_000
     rows = read(folder / "kept.csv")
     assert [(row["iteration"], row["steps"]) for row in rows] == [("2", "100"), ("4", "200")]
     for row in rows:

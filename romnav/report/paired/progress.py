@@ -1,0 +1,55 @@
+"""Success of the policies kept along the runs of an experiment, over steps and over CPU time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b")
+PANELS = (
+    ("steps", "sr_120_same", "same level, 120 s"),
+    ("steps", "sr_120_cross", "across levels, 120 s"),
+    ("hours", "sr_120_all", "all, 120 s"),
+)
+
+
+def slope(steps: pd.Series, rate: pd.Series) -> float:
+    """Points of success that a doubling of the steps gives, by least squares; NaN of fewer than two policies."""
+    if len(steps) < 2:
+        return float("nan")
+    return float(np.polyfit(np.log2(steps.to_numpy(float)), rate.to_numpy(float), 1)[0])
+
+
+def draw(arms: Mapping[str, pd.DataFrame], path: Path) -> None:
+    """Draw success against steps and hours of every arm, with its gain per doubling of the steps.
+
+    Args:
+        arms: Rows of ``kept.csv`` by label.
+        path: Figure; its suffix names the format.
+    """
+    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, len(PANELS)))
+    for panel, (over, column, title) in zip(axes, PANELS, strict=True):
+        for colour, (label, rows) in zip(COLOURS, arms.items(), strict=False):
+            gain = slope(rows["steps"], rows[column])
+            told = label if np.isnan(gain) else f"{label} ({gain:+.1f} a doubling)"
+            x = rows["steps"] / 1e6 if over == "steps" else rows[over]
+            panel.plot(x, rows[column], color=colour, marker="o", markersize=3, label=told)
+        panel.set_title(title, fontsize=9)
+        _finish(panel, "million steps" if over == "steps" else "hours of training")
+    axes[0].set_ylabel("success on the episodes for choices (%)")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+
+
+def _finish(panel: Axes, over: str) -> None:
+    panel.set_xscale("log", base=2)
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.set_xlabel(over)
+    panel.grid(alpha=0.25)
+    panel.legend(frameon=False, fontsize=7, loc="lower right")
