@@ -85,8 +85,8 @@ class Experiment(Config):
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
-            others = arm.changes.keys() - {"navigation"} | arm.changes.get("navigation", {}).keys() - BODY
-            if not arm.trained and others:
+            changes = arm.changes
+            if not arm.trained and changes.keys() - {"navigation"} | changes.get("navigation", {}).keys() - BODY:
                 what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
                 raise ValueError(f"{name} {what}, so it can only change navigation.dynamics")
             if arm.policy and arm.driver:
