@@ -104,7 +104,7 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     )
     assert romnav(*command).exit_code == 0
     assert ran == ["policy nocap, seed 0", "episodes nocap, seed 0"]
-    assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.995 -> 0.9)" in line for line in said)
+    assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.99 -> 0.9)" in line for line in said)
     ran.clear()
     assert romnav("train", "policy", "rom", "--no-resume").exit_code == 0
     assert ran == ["policy rom, seed 0"]
