@@ -135,6 +135,25 @@ class DeviceJob(Job):
     device: Annotated[str, typer.Option("--device", help="cpu, cuda or cuda:N.")] = "cpu"
 
 
+@dataclass(frozen=True)
+class RunJob(DeviceJob):
+    """Stages to make, or to be told of."""
+
+    listed: Annotated[
+        bool, typer.Option("--print", help="Print what would run as shell commands with their order, and run nothing.")
+    ] = False
+
+    def tell(self, targets: Sequence[Stage], again: Sequence[Stage], *words: str) -> None:
+        """Prints the commands of what `make` would run, then that with these ``words``, for a cluster's queue."""
+        from romnav.experiment.graph import plan, run
+
+        stages = run.pending(targets, () if self.resume else again)
+        device = () if self.device == "cpu" else ("--device", self.device)
+        over = () if self.resume else ("--no-resume",)
+        for line in plan.shell(stages, self.work.command(*words, *device), (*device, *over)):
+            typer.echo(line)
+
+
 def command(group: typer.Typer, name: str, **settings: Any) -> Callable[[Function], Function]:
     """Registers a function as a command of a group.
 
