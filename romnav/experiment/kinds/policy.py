@@ -120,7 +120,7 @@ def perception(
     pretrained = _encoders(work, work.arm_settings(str(trained.arm)))
     noises = {"lidar": noise, "depth": noise + DEPTH_NOISE}
     eyes = {
-        sensor: _eye(work, settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
+        sensor: eye(work, settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
         for sensor in ("lidar", *(pretrained.keys() - {"lidar"}))
     }
     return Perception(**eyes)
@@ -150,7 +150,7 @@ def _encoder(
     return encoders.untrained(spec, directions, seed).encoder.to(device).requires_grad_(False)
 
 
-def _eye(
+def eye(
     work: Workspace,
     settings: Scale,
     sensor: str,
