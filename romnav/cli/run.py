@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from romnav.cli.app import app, run
-from romnav.cli.options import DeviceJob, ExperimentArgument, Job, SeedOption, command, experiments
+from romnav.cli.options import ExperimentArgument, Job, RunJob, SeedOption, command, experiments
 from romnav.errors import NothingRecorded, RomnavError
 
 if TYPE_CHECKING:
@@ -16,11 +16,14 @@ if TYPE_CHECKING:
 
 
 @command(run, "ablation")
-def ablation(job: DeviceJob, name: ExperimentArgument, seed: SeedOption = None) -> None:
+def ablation(job: RunJob, name: ExperimentArgument, seed: SeedOption = None) -> None:
     """Train every arm of an ablation, evaluate them if it has tables of episodes, then write and print its tables."""
     from romnav.experiment.graph.run import with_all_above
 
     reports = _reports(job.work, "ablation", name, seed)
+    if job.listed:
+        job.tell(reports, with_all_above(reports), "run", "ablation", name, *_seed(seed))
+        return
     job.make(reports, with_all_above(reports), side_by_side=True)
     for report in reports:
         _print_tables(report)
@@ -31,7 +34,7 @@ def _register_trials(kind: str, purpose: str) -> None:
 
     @command(run, kind, help=f"{purpose} with the safety filter off and on; write table and figure.")
     def trials(
-        job: DeviceJob,
+        job: RunJob,
         name: ExperimentArgument = kind,
         arm: Annotated[
             list[str] | None, typer.Option("--arm", help="Only this arm, trained or scripted; may be repeated.")
@@ -45,7 +48,12 @@ def _register_trials(kind: str, purpose: str) -> None:
         for one in arm or ():
             if one not in known:
                 raise RomnavError(f"{job.project.file(name)}: no arm {one}{suggest(one, known)}")
-        job.make([stage for stage in report.upstream if not arm or stage.arm in arm])
+        driven = [stage for stage in report.upstream if not arm or stage.arm in arm]
+        if job.listed:
+            words = (word for one in arm or () for word in ("--arm", one))
+            job.tell(driven, driven, "run", kind, name, *words, *_seed(seed))
+            return
+        job.make(driven)
         job.draw([report])
         _print_tables(report)
 
@@ -88,6 +96,10 @@ def _reports(work: Workspace, kind: str, name: str, seed: int | None) -> list[St
             f"run `romnav run {experiment.kind} {name}`"
         )
     return reports(work, name, experiment.seeds if seed is None else (seed,))
+
+
+def _seed(seed: int | None) -> tuple[str, ...]:
+    return () if seed is None else ("--seed", str(seed))
 
 
 def _print_tables(stage: Stage) -> None:
