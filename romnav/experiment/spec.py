@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from romnav.config import Config
+from romnav.config import Config, Label, Name, Seed
 from romnav.errors import RomnavError
 
 SCRIPTED = ("oracle", "straight")
@@ -28,7 +28,7 @@ C = TypeVar("C", bound=Config)
 class Arm(Config, extra="allow"):
     """One arm: its label, and the scale's settings that it changes, e.g. ``navigation.ppo.gamma = 0.99``."""
 
-    label: str
+    label: Label
     """Name in lists."""
     policy: str | None = None
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
@@ -48,15 +48,15 @@ class Experiment(Config):
 
     kind: Literal["ablation", "safety", "deploy"]
     """What is done with the arms."""
-    title: str
+    title: Label
     """One line for lists."""
     tables: tuple[str, ...] = ()
     """Tables to write from the episode rows; without any, the arms are not evaluated."""
     curves: bool = False
     """Whether to draw and tabulate success while training, over all training seeds."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """Training seeds of every arm."""
-    arms: dict[str, Arm]
+    arms: dict[Name, Arm] = Field(min_length=1)
     """Arms by the name of their results folder."""
     scales: dict[str, dict[str, Any]] = Field(default={})
     """Settings that all arms change at a scale, e.g. ``scales.paper.navigation.env.envs = 3072``."""
@@ -76,9 +76,19 @@ class Experiment(Config):
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
-            if arm.policy and arm.changes.keys() - {"navigation"} | arm.changes.get("navigation", {}).keys() - BODY:
+            changed = arm.changes.get("navigation", {})
+            if arm.policy and (
+                arm.changes.keys() - {"navigation"} or not isinstance(changed, dict) or {*changed} - BODY
+            ):
                 raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
         return arms
+
+    @field_validator("seeds", "tables")
+    @classmethod
+    def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
+        if twice := [value for k, value in enumerate(values) if value in values[:k]]:
+            raise ValueError(f"{twice[0]} is there twice; name it once")
+        return values
 
 
 def load_experiments(folder: Path) -> dict[str, Experiment]:
@@ -115,7 +125,7 @@ def read_toml(file: Path) -> dict[str, Any]:
         RomnavError: It is missing or no TOML.
     """
     try:
-        return tomllib.loads(file.read_text("utf-8"))
+        return tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
         raise RomnavError(f"{file}: cannot be read ({(error.strerror or str(error)).lower()})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -133,7 +143,7 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
         return model.model_validate_json(json.dumps(data, default=str))
     except ValidationError as invalid:
         error = invalid.errors()[0]
-        key = prefix + ".".join(map(str, error["loc"]))
+        key = (prefix + ".".join(map(str, error["loc"]))).rstrip(".")
         raise RomnavError(f"{file}: {_explain(model, key, error)}") from invalid
 
 
