@@ -8,6 +8,8 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
+from pydantic import Field
+
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
@@ -16,6 +18,17 @@ from romnav.navigation.spec import MOST_STEPS, KickstartSpec, NavigationSpec
 from romnav.robot.spec import LocomotionSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
+
+
+class ResourcesSpec(Config):
+    """What a stage takes of a cluster's machine."""
+
+    cores: int = Field(default=1, ge=1)
+    """Cores: training runs on one thread."""
+    gpus: float = Field(default=0.0, ge=0.0)
+    """Share of a GPU, with ``--device cuda``."""
+    memory_gb: float = Field(default=3.0, gt=0.0)
+    """Memory (A: measured on a core, see docs/scale.md; `romnav describe scale` tells the largest parts)."""
 
 
 class Scale(Config):
@@ -45,6 +58,8 @@ class Scale(Config):
     """Trials in the obstacle sets."""
     deploy: DeploymentSpec = DeploymentSpec()
     """Trials in the deployments."""
+    resources: ResourcesSpec = ResourcesSpec()
+    """Share of a machine that a stage takes on a cluster."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
