@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 LARGEST = 1e6
 """Beyond any length, time, weight or factor that means something; its square still fits into float32."""
+
+LONGEST_LABEL = 80
 
 T = TypeVar("T")
 
@@ -25,6 +28,24 @@ def _ordered(values: tuple[T, T]) -> tuple[T, T]:
     if low > high:  # type: ignore[operator]
         raise ValueError(f"its least value {low} is above its largest {high}; exchange them")
     return values
+
+
+def name(value: str) -> str:
+    """A name of a file or folder that leads nowhere else.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}", value):
+        shown = value if len(value) <= 40 else f"{value[:40]}..."
+        raise ValueError(f"{shown!r} names no file; use up to 64 letters, digits and . _ + -, a letter or digit first")
+    return value
+
+
+def _label(value: str) -> str:
+    if not value.isprintable() or not value.strip() or len(value) > LONGEST_LABEL:
+        raise ValueError(f"{value[:40]!r} is no label; use one line of 1 to {LONGEST_LABEL} characters")
+    return value
 
 
 Range = Annotated[tuple[T, T], AfterValidator(_ordered)]
@@ -51,7 +72,7 @@ Pixels = Annotated[int, Field(ge=1, le=4096)]
 """Of an image along one side."""
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 """Of random numbers."""
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", max_length=64)]
+Name = Annotated[str, AfterValidator(name)]
 """Of a file or folder: nothing in it leads elsewhere."""
-Label = Annotated[str, Field(pattern=r"^\S([^\x00-\x1f\x7f]*\S)?$", max_length=80)]
-"""Of a list, table or figure: one line that can be seen."""
+Label = Annotated[str, AfterValidator(_label)]
+"""In a list, table or figure: one line that can be seen."""

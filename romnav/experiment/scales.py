@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
-from pydantic import Field
-
-from romnav.config import Config
+from romnav.config import Config, Count, Positive
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
@@ -23,11 +21,11 @@ from romnav.world.spec import WorldSpec
 class ResourcesSpec(Config):
     """What a stage takes of a cluster's machine."""
 
-    cores: int = Field(default=1, ge=1)
+    cores: Count = 1
     """Cores: training runs on one thread."""
-    gpus: float = Field(default=0.0, ge=0.0)
+    gpus: float = Field(default=0.0, ge=0.0, le=64.0)
     """Share of a GPU, with ``--device cuda``."""
-    memory_gb: float = Field(default=3.0, gt=0.0)
+    memory_gb: Positive = 3.0
     """Memory (A: measured on a core, see docs/scale.md; `romnav describe scale` tells the largest parts)."""
 
 

@@ -77,9 +77,8 @@ class Experiment(Config):
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
             changed = arm.changes.get("navigation", {})
-            if arm.policy and (
-                arm.changes.keys() - {"navigation"} or not isinstance(changed, dict) or {*changed} - BODY
-            ):
+            beside = arm.changes.keys() - {"navigation"}
+            if arm.policy and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
                 raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
         return arms
 
@@ -91,31 +90,46 @@ class Experiment(Config):
         return values
 
 
-def load_experiments(folder: Path) -> dict[str, Experiment]:
+def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
     """Reads every ``<folder>/<name>.toml``.
 
-    Raises:
-        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings.
+    Returns:
+        Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
+        no arm, or gives an arm other settings than one before it. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
-    experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
-    trained = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
-    seen: dict[str, tuple[str, Arm]] = {}
-    for name, experiment in experiments.items():
-        for scale in experiment.scales.keys() - known:
-            raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
-        for arm_name, arm in experiment.arms.items():
-            if arm.policy and arm.policy not in trained:
-                raise RomnavError(
-                    f"{folder / name}.toml: arms.{arm_name}.policy: no arm {arm.policy} that is trained"
-                    f"{suggest(arm.policy, trained)}"
-                )
-            first, same = seen.setdefault(arm_name, (name, arm))
-            if (same.changes, experiments[first].scales) != (arm.changes, experiment.scales):
-                raise RomnavError(
-                    f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
-                )
-    return experiments
+    read: dict[str, Experiment] = {}
+    wrong: dict[str, RomnavError] = {}
+    for file in sorted(folder.glob("*.toml")):
+        try:
+            read[file.stem] = parse(Experiment, read_toml(file), file)
+        except RomnavError as error:
+            wrong[file.stem] = error
+    trained = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
+    whole = not wrong  # an arm that is missed may be in what could not be read
+    experiments: dict[str, Experiment] = {}
+    for name, experiment in read.items():
+        if fault := _fault(experiment, experiments, known, trained if whole else None):
+            wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
+        else:
+            experiments[name] = experiment
+    return experiments, wrong
+
+
+def _fault(
+    experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], trained: set[str] | None
+) -> str | None:
+    """What of an experiment does not fit scales, trained arms if they are known, and the experiments ``before`` it."""
+    for scale in experiment.scales.keys() - scales:
+        return f"scales: unknown scale {scale}{suggest(scale, scales)}"
+    for arm_name, arm in experiment.arms.items():
+        if arm.policy and trained is not None and arm.policy not in trained:
+            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, trained)}"
+        for first, other in before.items():
+            same = other.arms.get(arm_name)
+            if same and (same.changes, other.scales) != (arm.changes, experiment.scales):
+                return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
+    return None
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -143,7 +157,7 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
         return model.model_validate_json(json.dumps(data, default=str))
     except ValidationError as invalid:
         error = invalid.errors()[0]
-        key = (prefix + ".".join(map(str, error["loc"]))).rstrip(".")
+        key = (prefix + ".".join(str(part) for part in error["loc"] if part != "[key]")).rstrip(".")
         raise RomnavError(f"{file}: {_explain(model, key, error)}") from invalid
 
 

@@ -176,7 +176,7 @@ class PPOSpec(Config):
     """Target of the adaptive learning rate (A)."""
     max_grad_norm: Positive = 1.0
     """Gradient clip (A)."""
-    keep: int | None = Field(default=None, ge=1)
+    keep: Count | None = None
     """Iterations after which the policy so far is kept beside the run, again and again (A: its success on the `dev`
     episodes shows progress where success while training depends on where the robots are let go)."""
     threads: Threads = 1

@@ -214,7 +214,7 @@ class TileTaskSpec(Config):
 
     robots: Robots = 0
     """Robots on tiles, besides those on lanes."""
-    begin: int = Field(default=0, ge=0)
+    begin: int = Field(default=0, ge=0, le=2**31 - 1)
     """Iterations before they join: until then the run is one without them."""
     world: WorldSpec = WorldSpec(tiles=48, side=20.0, goals_per_tile=32, classes=("building", "outdoor", "building"))
     """The tiles, small: walking needs no long ways, and classes without stairs teach little that lanes do not."""

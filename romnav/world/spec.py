@@ -18,6 +18,8 @@ DOORWAY = 1.2
 """Narrowest doorway of the generators, m."""
 LEAST_RISER, LEAST_TREAD = 0.05, 0.15
 """Flatter and shorter steps are no stairs, m."""
+MOST_TREAD = 1.0
+"""So that a flight fits into a building, m."""
 MOST_CELLS = 1000
 """Cells along a tile's side that still fit into memory."""
 
@@ -80,6 +82,8 @@ class WorldSpec(Config):
             return f"riser: {self.riser[0]} m; set both ends of the range to {LEAST_RISER} m or more"
         if self.tread[0] < LEAST_TREAD:
             return f"tread: {self.tread[0]} m; set both ends of the range to {LEAST_TREAD} m or more"
+        if self.tread[1] > MOST_TREAD:
+            return f"tread: {self.tread[1]} m; set both ends of the range to {MOST_TREAD} m or less"
         if self.riser[1] > step:
             return f"riser: up to {self.riser[1]} m, above grid.max_step, {step} m: no stair could be walked; lower it"
         climb = math.ceil(cell / self.tread[0] - 1e-9) * self.riser[1]
