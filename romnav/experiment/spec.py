@@ -7,15 +7,17 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from romnav.config import Config, Label, Name, Seed
 from romnav.errors import RomnavError
+from romnav.parts import Kind
 
 SCRIPTED = ("oracle", "straight")
 """Arms that need no training; every ablation is evaluated beside them."""
+DRIVERS = Kind("scripted driver", "romnav.drivers", "romnav.evaluation.rollout:Driver")
 RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
 """Names of other folders beside those of the arms: figures, and one for a kind of stage."""
 
@@ -32,11 +34,18 @@ class Arm(Config, extra="allow"):
     """Name in lists."""
     policy: str | None = None
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
+    driver: Annotated[str, DRIVERS] | None = Field(default=None, exclude_if=lambda driver: driver is None)
+    """Scripted driver from outside that it has in place of a policy, e.g. "pkg.mod:Name"."""
 
     @property
     def changes(self) -> dict[str, Any]:
         """Settings that differ from the scale's, nested by section."""
         return self.model_extra or {}
+
+    @property
+    def trained(self) -> bool:
+        """Whether it has a policy of its own."""
+        return not (self.policy or self.driver)
 
 
 TrialKind = Literal["safety", "deploy"]
@@ -78,8 +87,11 @@ class Experiment(Config):
         for name, arm in arms.items():
             changed = arm.changes.get("navigation", {})
             beside = arm.changes.keys() - {"navigation"}
-            if arm.policy and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
-                raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
+            if not arm.trained and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
+                what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
+                raise ValueError(f"{name} {what}, so it can only change navigation.dynamics")
+            if arm.policy and arm.driver:
+                raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
 
     @field_validator("seeds", "tables")
@@ -105,11 +117,11 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
             read[file.stem] = parse(Experiment, read_toml(file), file)
         except RomnavError as error:
             wrong[file.stem] = error
-    trained = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
+    drivers = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
     whole = not wrong  # an arm that is missed may be in what could not be read
     experiments: dict[str, Experiment] = {}
     for name, experiment in read.items():
-        if fault := _fault(experiment, experiments, known, trained if whole else None):
+        if fault := _fault(experiment, experiments, known, drivers if whole else None):
             wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
         else:
             experiments[name] = experiment
@@ -117,17 +129,17 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
 
 
 def _fault(
-    experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], trained: set[str] | None
+    experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
 ) -> str | None:
-    """What of an experiment does not fit scales, trained arms if they are known, and the experiments ``before`` it."""
+    """What of an experiment does not fit scales, arms that drive if they are known, and the experiments ``before`` it."""
     for scale in experiment.scales.keys() - scales:
         return f"scales: unknown scale {scale}{suggest(scale, scales)}"
     for arm_name, arm in experiment.arms.items():
-        if arm.policy and trained is not None and arm.policy not in trained:
-            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, trained)}"
+        if arm.policy and drivers is not None and arm.policy not in drivers:
+            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
         for first, other in before.items():
             same = other.arms.get(arm_name)
-            if same and (same.changes, other.scales) != (arm.changes, experiment.scales):
+            if same and (same.changes, same.driver, other.scales) != (arm.changes, arm.driver, experiment.scales):
                 return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
     return None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,6 +11,7 @@ from romnav.config import (
     Count,
     NonNegative,
     NonPositive,
+    Number,
     Positive,
     Range,
     Rate,
@@ -18,9 +19,13 @@ from romnav.config import (
     Threads,
     Width,
 )
+from romnav.parts import Kind
 from romnav.sensing.spec import CorruptionSpec
 from romnav.world.spec import SamplerSpec
 
+REWARDS = Kind("reward term", "romnav.rewards", "romnav.navigation.rewards:Term")
+NETWORKS = Kind("policy network", "romnav.networks", "romnav.navigation.policy:NavigationActor", called=False)
+BODIES = Kind("body", "romnav.bodies", "romnav.robot.dynamics:Dynamics", builtin=("rom", "g1"), called=False)
 MOST_STEPS = 1_000_000
 """Of an episode."""
 WIDEST_HEAD = 64
@@ -69,6 +74,8 @@ class RewardSpec(Config):
     """Vertical speed that earns the full height progress, m/s (A: a flight of stairs at half of the top speed)."""
     scale: Positive = 0.2
     """Common factor, s (A: the control period, so that returns are integrals over time)."""
+    terms: dict[Annotated[str, REWARDS], Number] = Field(default={}, exclude_if=lambda terms: not terms)
+    """Weights of terms from outside, by "pkg.mod:Name"."""
 
 
 class EnvSpec(Config):
@@ -119,6 +126,13 @@ class PolicySpec(Config):
     """Width of the dense layer before the Beta parameters (A)."""
     critic: tuple[Width, ...] = Field(default=(128, 128), min_length=1)
     """Hidden widths of the privileged critic (A)."""
+    network: Annotated[str, NETWORKS] | None = Field(default=None, exclude_if=lambda network: network is None)
+    """Policy network from outside, "pkg.mod:Name"."""
+
+    @property
+    def visual(self) -> int:
+        """Number of features that the network makes of the tokens."""
+        return (self.queries + 1) * self.attention
 
     @model_validator(mode="after")
     def _has_equal_heads(self) -> Self:
@@ -232,8 +246,9 @@ class KickstartSpec(Config):
 class NavigationSpec(Config):
     """Everything that the navigation stage needs beside world, sensors and encoder."""
 
-    dynamics: Literal["rom", "g1"] = "rom"
-    """The body that is driven: the reduced-order model, or the humanoid under its frozen locomotion policy."""
+    dynamics: Annotated[str, BODIES] = "rom"
+    """The body that is driven: the reduced-order model, "g1", the humanoid under its frozen locomotion policy, or one
+    from outside, "pkg.mod:Name"."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""
