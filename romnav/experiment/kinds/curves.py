@@ -35,13 +35,7 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             settings=experiment,
             uses=("title", "labels"),
             make=partial(_draw, work, experiment),
-<<<<<<< HEAD
-            upstream=tuple(
-                policy(work, name, seed) for name, arm in experiment.arms.items() if arm.trained for seed in seeds
-            ),
-=======
             upstream=policies(work, name, seeds),
->>>>>>> main
         )
     ]
 
@@ -64,7 +58,7 @@ def _draw(
 def policies(work: Workspace, name: str, seeds: Sequence[int]) -> tuple[Stage, ...]:
     """The training runs of an experiment."""
     arms = work.project.experiment(name).arms.items()
-    return tuple(policy(work, arm, seed) for arm, spec in arms if not spec.policy for seed in seeds)
+    return tuple(policy(work, arm, seed) for arm, spec in arms if spec.trained for seed in seeds)
 
 
 def finished(runs: Sequence[Stage]) -> list[Stage]:
