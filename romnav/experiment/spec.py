@@ -131,7 +131,7 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
 def _fault(
     experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
 ) -> str | None:
-    """What of an experiment does not fit scales, arms that drive if they are known, and the experiments ``before`` it."""
+    """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
     for scale in experiment.scales.keys() - scales:
         return f"scales: unknown scale {scale}{suggest(scale, scales)}"
     for arm_name, arm in experiment.arms.items():

@@ -262,7 +262,7 @@ def test_without_motion_nothing_is_remembered():
 def test_mistakes_are_named():
     with pytest.raises(ValidationError, match="smaller than a cell"):
         OccupancySpec(radius=0.04)
-    with pytest.raises(ValidationError, match="too small for a robot"):
+    with pytest.raises(ValidationError, match="too small for a radius"):
         OccupancySpec(size=1.0)
     with pytest.raises(RomnavError, match="points have shape"):
         Rasterizer(2)(torch.zeros(1, 5, 3))
