@@ -58,7 +58,7 @@ def _draw(
 def policies(work: Workspace, name: str, seeds: Sequence[int]) -> tuple[Stage, ...]:
     """The training runs of an experiment."""
     arms = work.project.experiment(name).arms.items()
-    return tuple(policy(work, arm, seed) for arm, spec in arms if not spec.policy for seed in seeds)
+    return tuple(policy(work, arm, seed) for arm, spec in arms if spec.trained for seed in seeds)
 
 
 def finished(runs: Sequence[Stage]) -> list[Stage]:

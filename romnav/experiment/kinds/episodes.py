@@ -33,6 +33,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(_set(work),),
+        code=driven.code,
         upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,

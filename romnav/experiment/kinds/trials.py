@@ -40,6 +40,11 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
             f"reduced-order model with a body; name {driver} in its place"
         )
     driven = Driven.by(work, arm, seed)
+    if driven.settings.navigation.dynamics not in ("rom", "g1"):
+        raise RomnavError(
+            f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.navigation.dynamics: trials need a body "
+            "that touches the solids themselves; set rom or g1"
+        )
     return Stage(
         kind="trials",
         name=f"{kind} {arm}, seed {driven.seed}",
@@ -50,6 +55,7 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
         uses=(kind, *driven.uses),
         make=partial(_run, driven, kind),
         reads=SCENES,
+        code=driven.code,
         upstream=driven.upstream,
         arm=arm,
         seed=driven.seed,
