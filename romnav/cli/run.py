@@ -40,14 +40,16 @@ def _register_trials(kind: str, purpose: str) -> None:
     ) -> None:
         from romnav.experiment.spec import suggest
 
-        (report,) = _reports(job.work, kind, name, seed)
-        known = {str(stage.arm) for stage in report.upstream}
+        reports = [report for report in _reports(job.work, kind, name, seed) if report.kind == "report"]
+        driven = reports[0].upstream
+        known = {str(stage.arm) for stage in driven}
         for one in arm or ():
             if one not in known:
                 raise RomnavError(f"{job.project.file(name)}: no arm {one}{suggest(one, known)}")
-        job.make([stage for stage in report.upstream if not arm or stage.arm in arm])
-        job.draw([report])
-        _print_tables(report)
+        job.make([stage for stage in driven if not arm or stage.arm in arm])
+        job.draw(reports)
+        for report in reports:
+            _print_tables(report)
 
 
 _register_trials("safety", "Drive every arm through the three obstacle sets")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from romnav.errors import RomnavError
-from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, suggest
+from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, parse, read_toml, suggest
+from romnav.report.spec import PAIRED, Published
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,21 @@ class Project:
         """The file of an experiment."""
         return self.root / "experiments" / f"{experiment}.toml"
 
+    def published(self, experiment: str) -> tuple[Path, Published] | None:
+        """The file of results that an experiment prints beside ours, and what it holds.
+
+        Raises:
+            RomnavError: There is no such file, or it is invalid.
+        """
+        name = self.experiment(experiment).published
+        if name is None:
+            return None
+        path = self.root / "experiments" / "published" / f"{name}.toml"
+        if not path.exists():
+            known = (file.stem for file in path.parent.glob("*.toml"))
+            raise RomnavError(f"{self.file(experiment)}: published: no {path.name}{suggest(name, known)}")
+        return path, parse(Published, read_toml(path), path)
+
     @property
     def arms(self) -> set[str]:
         """Names of all arms, trained and scripted."""
@@ -84,13 +101,23 @@ class Project:
         """Training seeds of an arm; a scripted one has only seed 0."""
         return (0,) if self.driver(arm) in SCRIPTED else self.having(arm)[1].seeds
 
+    def comparisons(self, arms: Collection[str]) -> list[tuple[str, str]]:
+        """Pairs of some arms: those of each experiment with its reference, or with the first that is among them."""
+        pairs: dict[frozenset[str], tuple[str, str]] = {}
+        for experiment in self.experiments.values():
+            first = experiment.compared_with
+            found = [arm for arm in dict.fromkeys((first, *experiment.arms, *SCRIPTED)) if arm in arms]
+            if found and found[0] not in SCRIPTED:
+                pairs |= {key: (found[0], b) for b in found[1:] if (key := frozenset((found[0], b))) not in pairs}
+        return list(pairs.values())
+
     def overview(self) -> str:
         """Experiments, arms, and the training seeds evaluated at each scale, as text."""
         lines = []
         for name, experiment in self.experiments.items():
             lines.append(f"{name}: {experiment.title} ({experiment.kind})")
             labels = [*((arm, spec.label) for arm, spec in experiment.arms.items())]
-            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.tables]
+            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.declared(name, PAIRED).tables]
             lines += [f"  {arm:<16} {label:<22} {self._evaluated(arm)}".rstrip() for arm, label in labels]
         return "\n".join(lines)
 

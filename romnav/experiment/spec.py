@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from romnav.config import Config
 from romnav.errors import RomnavError
+from romnav.report.spec import PAIRED, Entry, Kind, TableSpec
 
-SCRIPTED = ("oracle", "straight")
-"""Arms that need no training; every ablation is evaluated beside them."""
+SCRIPTED = {"oracle": "Oracle", "straight": "Straight"}
+"""Arms that need no training, and their labels; every ablation is evaluated beside them."""
 RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
 """Names of other folders beside those of the arms: figures, and one for a kind of stage."""
 
@@ -43,6 +45,14 @@ TrialKind = Literal["safety", "deploy"]
 """Experiments that drive arms through scenes, with the safety filter off and on."""
 
 
+class Declared(Config):
+    """Tables of an experiment, complete, with what they need of it."""
+
+    title: str
+    labels: dict[str, str]
+    tables: dict[str, TableSpec]
+
+
 class Experiment(Config):
     """Arms that are trained alike except for their changes, and evaluated on the same episodes or trials."""
 
@@ -50,10 +60,13 @@ class Experiment(Config):
     """What is done with the arms."""
     title: str
     """One line for lists."""
-    tables: tuple[str, ...] = ()
-    """Tables to write from the episode rows; without any, the arms are not evaluated."""
-    curves: bool = False
-    """Whether to draw and tabulate success while training, over all training seeds."""
+    tables: dict[str, TableSpec] = Field(default={})
+    """Tables to write, by the name of their files; without any, the usual ones. What none of them needs is not run:
+    where all are of learning curves, the arms are not evaluated."""
+    reference: str = ""
+    """Arm that the others are compared with; empty is the first."""
+    published: str | None = None
+    """Results to print beside ours: a file under experiments/published/."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds of every arm."""
     arms: dict[str, Arm]
@@ -65,6 +78,39 @@ class Experiment(Config):
     def labels(self) -> dict[str, str]:
         """Label of every arm."""
         return {name: arm.label for name, arm in self.arms.items()}
+
+    @property
+    def compared_with(self) -> str:
+        """The reference arm."""
+        return self.reference or next(iter(self.arms))
+
+    def declared(self, name: str, kinds: Collection[Kind]) -> Declared:
+        """The tables of some kinds, completed; ``name`` is the experiment's."""
+        if self.kind != "ablation":
+            usual = {name: TableSpec(kind="trials")}
+        else:
+            usual = {name: TableSpec(bounds=_entries(SCRIPTED))}
+            if len(self.arms) > 1:
+                usual[f"{name}-contrasts"] = TableSpec(kind="contrasts", bounds=_entries(SCRIPTED))
+        tables = {n: self._complete(t) for n, t in (self.tables or usual).items() if t.kind in kinds}
+        return Declared(title=self.title, labels=self.labels, tables=tables)
+
+    def _complete(self, table: TableSpec) -> TableSpec:
+        if table.kind not in PAIRED:
+            return table
+        labels = SCRIPTED | self.labels
+        reference = table.reference.arm or self.compared_with
+        others = [arm for arm in self.arms if table.kind != "contrasts" or arm != reference]
+
+        def labelled(entries: Iterable[Entry], **update: Any) -> tuple[Entry, ...]:
+            return tuple(e.model_copy(update={"label": e.label or labels[e.arm], **update}) for e in entries)
+
+        update = {
+            "reference": labelled([table.reference.model_copy(update={"arm": reference})])[0],
+            "rows": tuple(map(labelled, table.rows or (_entries(others),))),
+            "bounds": labelled(table.bounds, competes=False),
+        }
+        return table.model_copy(update=update)
 
     def driver(self, arm: str) -> str:
         """The arm whose policy drives ``arm``."""
@@ -80,18 +126,46 @@ class Experiment(Config):
                 raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
         return arms
 
+    @model_validator(mode="after")
+    def _tables_of_its_arms(self) -> Experiment:
+        known = {*self.arms, *SCRIPTED}
+        if not self.arms:
+            raise ValueError("arms: there is none")
+        if self.reference and self.reference not in known:
+            raise ValueError(f"reference: no arm {self.reference}{suggest(self.reference, known)}")
+        for name, table in self.tables.items():
+            if not re.fullmatch(r"[\w.-]+", name):
+                raise ValueError(f"tables.{name}: files are called so; use letters, digits, - and _")
+            if (table.kind == "trials") != (self.kind != "ablation"):
+                raise ValueError(f"tables.{name}.kind: {table.kind} is no table of an experiment of kind {self.kind}")
+            for arm in (table.reference.arm, *(entry.arm for entry in table.entries)):
+                if arm and arm not in known:
+                    raise ValueError(f"tables.{name}: no arm {arm}{suggest(arm, known)}")
+            if table.kind == "contrasts" and not table.rows and len(self.arms) < 2:
+                raise ValueError(f"tables.{name}: there is one arm; contrasts are of several")
+        return self
+
+
+def _entries(arms: Iterable[str]) -> tuple[Entry, ...]:
+    return tuple(Entry(arm=arm) for arm in arms)
+
 
 def load_experiments(folder: Path) -> dict[str, Experiment]:
     """Reads every ``<folder>/<name>.toml``.
 
     Raises:
-        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings.
+        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings or two
+            tables one name.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
     experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
     trained = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
     seen: dict[str, tuple[str, Arm]] = {}
+    tables: dict[str, str] = {}
     for name, experiment in experiments.items():
+        for table in experiment.declared(name, get_args(Kind)).tables:
+            if (other := tables.setdefault(table, name)) != name:
+                raise RomnavError(f"{folder}: {other}.toml and {name}.toml both have a table {table}; rename one")
         for scale in experiment.scales.keys() - known:
             raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
         for arm_name, arm in experiment.arms.items():

@@ -13,7 +13,7 @@ from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.locomotion import humanoid
-from romnav.experiment.spec import SCRIPTED, Experiment, TrialKind
+from romnav.experiment.spec import SCRIPTED, TrialKind
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -87,23 +87,26 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
     rolls = any(work.arm_settings(arm).navigation.dynamics == "rom" for arm in experiment.arms)
     bounds = [(arm, 0) for arm in SCRIPTED if rolls]
     arms = [*((arm, seed) for arm in experiment.arms for seed in seeds), *bounds]
+    declared, published = experiment.declared(name, {"trials"}), work.project.published(name)
     return [
         Stage(
             kind="report",
-            name=f"report {name}",
+            name=f"report {table}",
             folder=work.folder,
-            outputs=(*(f"tables/{name}.{format}" for format in ("tex", "md", "csv")), f"figures/{name}.png"),
-            record=work.folder / "tables" / f"{name}.json",
-            settings=experiment,
-            uses=("labels",),
-            make=partial(_report, name, experiment, kind),
+            outputs=(*(f"tables/{table}.{format}" for format in ("tex", "md", "csv")), f"figures/{table}.png"),
+            record=work.folder / "tables" / f"{table}.json",
+            settings=declared,
+            uses=("labels", "tables"),
+            make=partial(_report, work, name, table, kind),
+            reads=(published[0],) if published else (),
             upstream=tuple(trials(work, kind, arm, seed) for arm, seed in arms),
         )
+        for table in declared.tables
     ]
 
 
 def _report(
-    name: str, experiment: Experiment, kind: TrialKind, stage: Stage, session: Session, progress: Progress
+    work: Workspace, name: str, table: str, kind: TrialKind, stage: Stage, session: Session, progress: Progress
 ) -> dict[str, Any]:
     """Of the arms that have been driven."""
     from romnav.evaluation.trials import rows
@@ -114,12 +117,14 @@ def _report(
     runs = [rows.read(file) for file in files if file.exists()]
     if not runs:
         raise NothingRecorded(f"{files[0]}: no trials yet; run `romnav run {' '.join({kind: 0, name: 0})}`")
-    scenes = _scenes(kind)
+    scenes, published = _scenes(kind), work.project.published(name)
     tabulate, draw = {
         "safety": (tables.safety, pictures.draw_safety),
         "deploy": (tables.deploy, pictures.draw_deployments),
     }[kind]
-    formats.write(replace(tabulate(runs, scenes, experiment.labels), name=name), stage.folder / "tables")
+    labels = work.project.experiment(name).labels
+    made = tabulate(runs, scenes, labels, published[1] if published else None)
+    formats.write(replace(made, name=table), stage.folder / "tables")
     draw(runs[0], scenes, stage.folder / stage.outputs[-1])
     return {}
 
