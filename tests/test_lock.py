@@ -16,7 +16,7 @@ sys.path.append(str(ROOT / "tools"))
 import lock  # noqa: E402
 
 LOWEST = [
-    "rsl-rl-lib==5.5.0", "tensordict==0.12.0", "mujoco==3.5.0", "warp-lang==1.12.0", "typer==0.20.0",
+    "rsl-rl-lib==5.5.0", "tensordict==0.12.0", "mujoco==4.0.0", "warp-lang==1.15.0", "typer==0.20.0",
     "pydantic==2.12.0", "pydantic-core==2.41.1", "rich==14.0.0", "numpy==2.2.0", "pandas==2.3.0", "pyarrow==21.0.0",
     "scipy==1.15.0", "matplotlib==3.10.0", "osqp==1.0.1",
 ]  # fmt: skip

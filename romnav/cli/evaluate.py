@@ -38,7 +38,6 @@ RESULT_COLUMNS = {
     "t2g": "T2G/s",
     "spl": "SPL",
     "falls": "falls",
-    "timeouts": "timeouts",
 }
 TERRAIN_COLUMNS = {
     "terrain": "terrain",
@@ -59,23 +58,10 @@ NAVIGATION_COLUMNS = {
     "sr_45": "SR@45",
     "sr_120": "SR@120",
 }
-CONTRAST_COLUMNS = {
-    "a": "a",
-    "b": "b",
-    "horizon": "s",
-    "level": "level",
-    "diff": "diff",
-    "lo": "lo",
-    "hi": "hi",
-    "n": "n",
-}
+CONTRAST_COLUMNS = {"arms": "arms", "horizon": "s", "level": "level", "diff": "diff", "interval": "95 %"}
 VERBOSE_COLUMNS = {
-    **CONTRAST_COLUMNS,
-    "tile_lo": "by tile: lo",
-    "tile_hi": "hi",
-    "a_only": "only a",
-    "b_only": "only b",
-    "mid_p": "McNemar p",
+    **{"arms": "arms", "horizon": "s", "level": "level", "by_tile": "95 %, by tile"},
+    **{"only": "only one", "mid_p": "McNemar p"},
 }
 AllPairsOption = Annotated[
     bool, typer.Option("--all-pairs", help="Compare every two arms, not only each with the reference arm.")
@@ -247,7 +233,22 @@ def _pairs(arms: list[str], compared: list[tuple[str, str]], all_pairs: bool) ->
 def _print_results(collected: dict[str, Any], arms: list[str], pairs: list[tuple[str, str]], verbose: bool) -> None:
     """Prints metrics (percent, s) of arms and contrasts (percentage points) of pairs of them."""
     print_table("Success rates in percent", [run for run in collected["arms"] if run["arm"] in arms], RESULT_COLUMNS)
-    rows = [c for pair in pairs for c in collected["contrasts"] if (c["a"], c["b"]) == pair]
-    columns = VERBOSE_COLUMNS if verbose else CONTRAST_COLUMNS
-    print_table("Paired differences a - b in percentage points, 95 % intervals", rows, columns)
+    rows = [_words(c) for pair in pairs for c in collected["contrasts"] if (c["a"], c["b"]) == pair]
+    print_table("Paired differences in percentage points", rows, CONTRAST_COLUMNS)
+    if verbose:
+        print_table("How sure they are, and how many episodes only one arm solves", rows, VERBOSE_COLUMNS)
     typer.echo(f"scale {collected['scale']}, episode set {collected['episode_set']}")
+
+
+def _words(contrast: dict[str, Any]) -> dict[str, Any]:
+    def interval(lo: float | None, hi: float | None) -> str | None:
+        return None if lo is None or hi is None else f"{lo:+.1f} to {hi:+.1f}"
+
+    only = None if contrast["a_only"] is None else f"{contrast['a_only']} : {contrast['b_only']}"
+    return contrast | {
+        "arms": f"{contrast['a']} - {contrast['b']}",
+        "diff": None if contrast["diff"] is None else f"{contrast['diff']:+.1f}",
+        "interval": interval(contrast["lo"], contrast["hi"]),
+        "by_tile": interval(contrast["tile_lo"], contrast["tile_hi"]),
+        "only": only,
+    }

@@ -104,11 +104,11 @@ class Project:
     def comparisons(self, arms: Collection[str]) -> list[tuple[str, str]]:
         """Pairs of some arms: those of each experiment with its reference, or with the first that is among them."""
         pairs: dict[frozenset[str], tuple[str, str]] = {}
-        for experiment in self.experiments.values():
-            first = experiment.compared_with
-            found = [arm for arm in dict.fromkeys((first, *experiment.arms, *SCRIPTED)) if arm in arms]
-            if found and found[0] not in SCRIPTED:
-                pairs |= {key: (found[0], b) for b in found[1:] if (key := frozenset((found[0], b))) not in pairs}
+        for bounds in ((), SCRIPTED):  # below all others
+            for experiment in self.experiments.values():
+                found = [arm for arm in (experiment.compared_with, *experiment.arms) if arm in arms]
+                for other in (arm for arm in (*found[1:], *bounds) if found and arm in arms and arm != found[0]):
+                    pairs.setdefault(frozenset((found[0], other)), (found[0], other))
         return list(pairs.values())
 
     def overview(self) -> str:

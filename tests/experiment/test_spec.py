@@ -15,7 +15,6 @@ ROOT = Path(__file__).parents[2]
 EXPERIMENT = """
 kind = "ablation"
 title = "t"
-tables = ["a"]
 [arms.rom]
 label = "RoM"
 [arms.slow]
@@ -81,6 +80,32 @@ def test_an_invalid_experiment_is_one_clear_error(tmp_path: Path, text: str, mes
     with pytest.raises(RomnavError) as error:
         load_experiments(tmp_path)
     assert str(error.value) == f"{file}: {message}"
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ('[tables.x]\nkin = "contrasts"', "unknown key tables.x.kin; did you mean kind?"),
+        ('[tables.x]\nrows = ["rmo"]', "tables.x: no arm rmo; did you mean rom?"),
+        ('[tables.x]\nkind = "trials"', "tables.x.kind: trials is no table of an experiment of kind ablation"),
+        ('[tables.x]\nkind = "curves"\nrows = ["rom"]', "tables.x: a table of kind curves has no rows to choose"),
+        ('[tables."a/b"]', "tables.a/b: files are called so; use letters, digits, - and _"),
+        ('[tables.x]\ncolumns = [{ header = "H" }]', "key tables.x.columns.0.metric is missing"),
+    ],
+)
+def test_an_invalid_table_is_one_clear_error(tmp_path: Path, tables: str, message: str) -> None:
+    file = tmp_path / "e.toml"
+    file.write_text(f"{EXPERIMENT}{tables}\n")
+    with pytest.raises(RomnavError) as error:
+        load_experiments(tmp_path)
+    assert str(error.value) == f"{file}: {message}"
+
+
+def test_a_table_has_one_experiment(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.toml").write_text(f"{EXPERIMENT}[tables.mine]\n")
+    with pytest.raises(RomnavError, match=r"a\.toml and b\.toml both have a table mine; rename one"):
+        load_experiments(tmp_path)
 
 
 def test_an_arm_of_two_experiments_is_the_same_arm(tmp_path: Path) -> None:

@@ -54,6 +54,12 @@ def known_metrics(kind: Kind) -> list[str]:
     return metrics if kind == "contrasts" else [*metrics, *COSTS]
 
 
+def meaning(metric: str) -> Metric | Cost:
+    """What the name of a column stands for, at whichever level."""
+    name = split(metric)[0]
+    return COSTS.get(name) or METRICS[name]
+
+
 def build(name: str, spec: TableSpec, title: str, bootstrap: Bootstrap, published: Published | None = None) -> Table:
     """Makes a table of the arms of a bootstrap; trained arms that were not evaluated are shown as dashes.
 
@@ -73,7 +79,7 @@ def build(name: str, spec: TableSpec, title: str, bootstrap: Bootstrap, publishe
     headers = tuple(column.header or _header(column.metric) for column in columns)
     if spec.kind == "contrasts":
         ours, theirs = _contrasts(spec, columns, bootstrap, published)
-        rates = all(_meant(column.metric).unit == "%" for column in columns)
+        rates = all(meaning(column.metric).unit == "%" for column in columns)
         headers = ("Contrast (%)" if rates else "Contrast", *headers)
         spans = () if spec.columns else _SPANS
     else:
@@ -91,13 +97,8 @@ def build(name: str, spec: TableSpec, title: str, bootstrap: Bootstrap, publishe
     return Table(name, caption, spans, headers, tuple(column.metric for column in columns), blocks, provenance)
 
 
-def _meant(metric: str) -> Metric | Cost:
-    name = split(metric)[0]
-    return COSTS.get(name) or METRICS[name]
-
-
 def _header(metric: str) -> str:
-    level, meant = split(metric)[1], _meant(metric)
+    level, meant = split(metric)[1], meaning(metric)
     label = meant.label if level == "all" else f"{meant.label}, {level}"
     return f"{label} ({meant.unit})" if meant.unit else label
 
@@ -110,9 +111,9 @@ def _caption(spec: TableSpec, title: str, columns: Sequence[Column]) -> str:
             f"{title}: paired differences of {reference} to each other arm. Positive: more of it with {reference}; "
             "† marks a 95% confidence interval excluding zero."
         )
-    meant = dict.fromkeys(_meant(column.metric) for column in columns)
-    meaning = "; ".join(f"{metric.label}: {metric.definition}" for metric in meant)
-    return f"{title}. {meaning}. Bold marks the best arm per column."
+    metrics = dict.fromkeys(meaning(column.metric) for column in columns)
+    definitions = "; ".join(f"{metric.label}: {metric.definition}" for metric in metrics)
+    return f"{title}. {definitions}. Bold marks the best arm per column."
 
 
 def _performance(
@@ -135,7 +136,7 @@ def _performance(
     known = published.arms if published else {}
 
     def theirs(arm: str, column: Column) -> Cell:
-        return number(known.get(arm, {}).get(column.metric, math.nan), _meant(column.metric).decimals)
+        return number(known.get(arm, {}).get(column.metric, math.nan), meaning(column.metric).decimals)
 
     bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
     stated = {metric for entry in spec.entries for metric in known.get(entry.arm, ())}
@@ -152,7 +153,7 @@ def _with_best(
     def column_cells(column: Column) -> dict[str, Cell]:
         cells = {entry.arm: cell(entry.arm, column) for block in blocks for entry in block}
         shown = {arm: float(cells[arm].text) for arm in competing if math.isfinite(cells[arm].value)}
-        better = _meant(column.metric).better
+        better = meaning(column.metric).better
         best = {"higher": max, "lower": min}[better](shown.values()) if better and column.bold and shown else None
         return {arm: dataclasses.replace(c, bold=shown.get(arm, math.nan) == best) for arm, c in cells.items()}
 
@@ -175,7 +176,7 @@ def _contrasts(
     known = published.contrasts.get(spec.reference.arm, {}) if published else {}
 
     def theirs(arm: str, column: Column) -> Cell:
-        decimals, stated = _meant(column.metric).decimals, known.get(arm, {}).get(column.metric)
+        decimals, stated = meaning(column.metric).decimals, known.get(arm, {}).get(column.metric)
         if stated is None:
             return number(math.nan, decimals)
         return number(stated.diff, decimals, sign=True, dagger=stated.significant)
