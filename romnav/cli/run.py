@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from romnav.cli.app import app, run
-from romnav.cli.options import DeviceJob, ExperimentArgument, Job, SeedOption, command, experiments
+from romnav.cli.options import ExperimentArgument, Job, RunJob, SeedOption, command, experiments
 from romnav.errors import NothingRecorded, RomnavError
 
 if TYPE_CHECKING:
@@ -16,11 +16,14 @@ if TYPE_CHECKING:
 
 
 @command(run, "ablation")
-def ablation(job: DeviceJob, name: ExperimentArgument, seed: SeedOption = None) -> None:
+def ablation(job: RunJob, name: ExperimentArgument, seed: SeedOption = None) -> None:
     """Train every arm of an ablation, evaluate them if it has tables of episodes, then write and print its tables."""
     from romnav.experiment.graph.run import with_all_above
 
     reports = _reports(job.work, "ablation", name, seed)
+    if job.listed:
+        job.tell(reports, with_all_above(reports), "run", "ablation", name, *_seed(seed))
+        return
     job.make(reports, with_all_above(reports), side_by_side=True)
     for report in reports:
         _print_tables(report)
@@ -31,7 +34,7 @@ def _register_trials(kind: str, purpose: str) -> None:
 
     @command(run, kind, help=f"{purpose} with the safety filter off and on; write table and figure.")
     def trials(
-        job: DeviceJob,
+        job: RunJob,
         name: ExperimentArgument = kind,
         arm: Annotated[
             list[str] | None, typer.Option("--arm", help="Only this arm, trained or scripted; may be repeated.")
@@ -41,12 +44,16 @@ def _register_trials(kind: str, purpose: str) -> None:
         from romnav.experiment.spec import suggest
 
         reports = [report for report in _reports(job.work, kind, name, seed) if report.kind == "report"]
-        driven = reports[0].upstream
-        known = {str(stage.arm) for stage in driven}
+        known = {str(stage.arm) for stage in reports[0].upstream}
         for one in arm or ():
             if one not in known:
                 raise RomnavError(f"{job.project.file(name)}: no arm {one}{suggest(one, known)}")
-        job.make([stage for stage in driven if not arm or stage.arm in arm])
+        driven = [stage for stage in reports[0].upstream if not arm or stage.arm in arm]
+        if job.listed:
+            words = (word for one in arm or () for word in ("--arm", one))
+            job.tell(driven, driven, "run", kind, name, *words, *_seed(seed))
+            return
+        job.make(driven)
         job.draw(reports)
         for report in reports:
             _print_tables(report)
@@ -90,6 +97,10 @@ def _reports(work: Workspace, kind: str, name: str, seed: int | None) -> list[St
             f"run `romnav run {experiment.kind} {name}`"
         )
     return reports(work, name, experiment.seeds if seed is None else (seed,))
+
+
+def _seed(seed: int | None) -> tuple[str, ...]:
+    return () if seed is None else ("--seed", str(seed))
 
 
 def _print_tables(stage: Stage) -> None:

@@ -3,50 +3,22 @@
 from __future__ import annotations
 
 import copy
-import io
-import pickle
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import torch
 from pydantic import ValidationError
 from tensordict import TensorDict
 
-from romnav import files
 from romnav.errors import RomnavError
 from romnav.navigation.policy import BEARING, NavigationActor
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.encoder import Encoder
+from romnav.tensors import Kind
 
-FORMAT = "romnav-policy-1"
-TORN = (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
-
-
-def save(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` in one step."""
-    buffer = io.BytesIO()
-    torch.save({"format": FORMAT, **content}, buffer)
-    with files.atomic(path) as file:
-        file.write(buffer.getvalue())
-
-
-def read(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """Content of a policy or training checkpoint.
-
-    Raises:
-        RomnavError: The file is missing, torn or no policy.
-    """
-    try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise RomnavError(f"{path}: no such policy; train it by `romnav train policy ARM`") from None
-    except TORN as error:
-        raise RomnavError(f"{path}: truncated or no checkpoint; delete it and train the arm again") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise RomnavError(f"{path}: key 'format' is not {FORMAT!r}; delete it and train the arm again")
-    return content
+KIND = Kind("romnav-policy-1", "policy", "train the arm by `romnav train policy`")
+"""Policies, and the states of unfinished runs."""
+save, read = KIND.save, KIND.load
 
 
 def load_actor(

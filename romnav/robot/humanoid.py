@@ -237,12 +237,12 @@ class Humanoid:
         self._enter_tiles()
         self.control.restore(torch.arange(len(envs)), walking)
         # After `restore`, which forgets contacts and the solver's warm start.
-        self.robots.load_state_dict({name: value[envs.numpy()] for name, value in state.items()})
+        self.robots.load_state_dict({name: value[envs] for name, value in state.items()})
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that changes while stepping."""
         own = {name: getattr(self, name).clone() for name in _STATE}
-        physics = {f"physics.{name}": torch.from_numpy(value) for name, value in self.robots.state_dict().items()}
+        physics = {f"physics.{name}": value for name, value in self.robots.state_dict().items()}
         walker = self.control.snapshot(torch.arange(len(self.tile)))
         return own | physics | {f"walker.{name}": value for name, value in walker.items()}
 
@@ -258,4 +258,4 @@ class Humanoid:
                 parts[part][key] = value
         self.control.restore(torch.arange(len(self.tile)), parts["walker"])
         # After `restore`, which forgets contacts and the solver's warm start.
-        self.robots.load_state_dict({name: value.numpy() for name, value in parts["physics"].items()})
+        self.robots.load_state_dict(parts["physics"])

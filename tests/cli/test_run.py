@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,12 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
         'cap = "euclidean"\n\n[arms.uniform-nocap]',
         'cap = "euclidean"\nnavigation.ppo.gamma = 0.9\n\n[arms.uniform-nocap]',
     )
-    assert romnav(*command).exit_code == 0
+    planned = romnav(*command, "--print").stdout.splitlines()
+    assert ran == []
+    assert [line.partition(" # ")[2] for line in planned] == ["1", "2 after 1", "3 after 1,2"]
+    for line in planned:
+        result = romnav(*shlex.split(line, comments=True)[1:])
+        said.append(result.stderr)
     assert ran == ["policy nocap, seed 0", "episodes nocap, seed 0"]
     assert any("policy nocap, seed 0 (changed: navigation.ppo.gamma: 0.99 -> 0.9)" in line for line in said)
     ran.clear()
