@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from romnav import parts
 from romnav.errors import RomnavError
 from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, parse, read_toml, suggest
 from romnav.report.spec import PAIRED, Published
@@ -31,6 +32,7 @@ class Project:
         folder = Path.cwd()
         for root in (folder, *folder.parents):
             if (root / "experiments" / "scales").is_dir():
+                parts.search(root)
                 return cls(root, results or root / "results")
         raise RomnavError(f"{folder}: no experiments/ here or above; change to a copy of the romnav repository")
 
@@ -58,20 +60,29 @@ class Project:
         """The file of an experiment."""
         return self.root / "experiments" / f"{experiment}.toml"
 
-    def published(self, experiment: str) -> tuple[Path, Published] | None:
-        """The file of results that an experiment prints beside ours, and what it holds.
+    def published_files(self, experiment: str) -> tuple[Path, ...]:
+        """The file of results that an experiment prints beside ours, if it names one.
 
         Raises:
-            RomnavError: There is no such file, or it is invalid.
+            RomnavError: There is no such file.
         """
         name = self.experiment(experiment).published
         if name is None:
-            return None
+            return ()
         path = self.root / "experiments" / "published" / f"{name}.toml"
         if not path.exists():
             known = (file.stem for file in path.parent.glob("*.toml"))
             raise RomnavError(f"{self.file(experiment)}: published: no {path.name}{suggest(name, known)}")
-        return path, parse(Published, read_toml(path), path)
+        return (path,)
+
+    def published(self, experiment: str) -> Published | None:
+        """The results that an experiment prints beside ours.
+
+        Raises:
+            RomnavError: There is no such file, or it is invalid.
+        """
+        read = [parse(Published, read_toml(path), path) for path in self.published_files(experiment)]
+        return read[0] if read else None
 
     @property
     def arms(self) -> set[str]:
@@ -97,9 +108,18 @@ class Project:
         """
         return arm if arm in SCRIPTED else self.having(arm)[1].driver(arm)
 
+    def script(self, arm: str) -> str | None:
+        """The scripted driver of an arm that has one in place of a policy.
+
+        Raises:
+            RomnavError: There is no such arm.
+        """
+        driver = self.driver(arm)
+        return driver if driver in SCRIPTED else self.having(driver)[1].arms[driver].driver
+
     def seeds(self, arm: str) -> tuple[int, ...]:
         """Training seeds of an arm; a scripted one has only seed 0."""
-        return (0,) if self.driver(arm) in SCRIPTED else self.having(arm)[1].seeds
+        return (0,) if self.script(arm) else self.having(arm)[1].seeds
 
     def comparisons(self, arms: Collection[str]) -> list[tuple[str, str]]:
         """Pairs of some arms: those of each experiment with its reference, or with the first that is among them."""

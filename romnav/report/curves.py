@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -140,11 +141,17 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
 
 
 def tabulate(
-    name: str, caption: str, arms: Mapping[str, Curves], provenance: dict[str, str], published: Published | None = None
+    name: str,
+    caption: str,
+    arms: Mapping[str, Curves],
+    provenance: dict[str, str],
+    sources: Mapping[str, tuple[Mapping[str, Any], ...]],
+    published: Published | None = None,
 ) -> Table:
-    """Final success and iteration time of every arm; times are relative to the first arm's frozen iterations."""
+    """Final success and iteration time of every arm, with what their runs come from; times are relative to the first
+    arm's frozen iterations."""
     reference = next(iter(arms.values())).iteration_time(unfrozen=False)
-    ours = tuple(Row(curves.label, _cells(curves, reference)) for curves in arms.values())
+    ours = tuple(Row(curves.label, _cells(curves, reference), sources[arm]) for arm, curves in arms.items())
     dash = number(math.nan, 1)
     known = {} if published is None else {arm: published.arms.get(arm, {}).get("iteration_time") for arm in arms}
     theirs = tuple(

@@ -8,10 +8,10 @@ from pydantic import Field, field_validator, model_validator
 
 from romnav.config import Config
 
-Kind = Literal["performance", "success", "failures", "contrasts", "curves", "trials"]
-_CHOICES: dict[Kind, set[str]] = {"curves": {"kind", "caption"}, "trials": {"kind"}}
+TableKind = Literal["performance", "success", "failures", "contrasts", "curves", "trials"]
+_CHOICES: dict[TableKind, set[str]] = {"curves": {"kind", "caption"}, "trials": {"kind"}}
 """What can be chosen of tables that are no lists of metrics."""
-PAIRED: frozenset[Kind] = frozenset({"performance", "success", "failures", "contrasts"})
+PAIRED: frozenset[TableKind] = frozenset({"performance", "success", "failures", "contrasts"})
 """Kinds that are made of paired episodes."""
 
 
@@ -50,7 +50,7 @@ class Column(Config):
 class TableSpec(Config):
     """A table of an experiment. Everything can be left out but what is not to be as usual."""
 
-    kind: Kind = "performance"
+    kind: TableKind = "performance"
     """What it shows: metrics per arm (performance; success or failures by level), differences of each arm to the
     reference (contrasts), where training ends (curves), or trials in scenes with the safety filter off and on."""
     caption: str = ""

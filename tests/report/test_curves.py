@@ -73,7 +73,8 @@ def test_iteration_times_are_of_the_phases_and_shrug_off_outliers(arms: dict[str
 
 def test_the_table_has_our_rows_and_the_papers(arms: dict[str, curves.Curves]) -> None:
     paper = Published(title="Paper", arms={"frozen": {"iteration_time": 1.0}, "unfrozen": {"iteration_time": 1.15}})
-    table = curves.tabulate("pretrain", "Encoder.", arms, {"scale": "smoke", "commit": "abc"}, paper)
+    provenance, sources = {"scale": "smoke", "commit": "abc"}, dict.fromkeys(arms, ())
+    table = curves.tabulate("pretrain", "Encoder.", arms, provenance, sources, paper)
     ours, published = table.blocks
     assert [row.label for row in ours.rows] == ["Frozen", "Unfrozen @ half", "No Pretraining"]
     assert [row.cells[2].text for row in ours.rows] == ["1.00", "1.50", "1.50"]
@@ -83,7 +84,7 @@ def test_the_table_has_our_rows_and_the_papers(arms: dict[str, curves.Curves]) -
     assert final.lo < ours.rows[1].cells[0].value < final.hi
     assert "training seeds per arm: 3" in table.caption
     assert table.caption.endswith("commit abc. Paper: as published, wall-clock time on a GPU.")
-    alone = curves.tabulate("pretrain", "Encoder.", arms, {"scale": "smoke", "commit": "abc"})
+    alone = curves.tabulate("pretrain", "Encoder.", arms, provenance, sources)
     assert (len(alone.blocks), alone.caption[-4:]) == (1, "abc.")
     for render in (formats.latex, formats.markdown, formats.to_csv):
         assert "No Pretraining" in render(table)

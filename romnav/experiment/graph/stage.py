@@ -61,6 +61,8 @@ class Stage:
     """Dotted names of the settings that its output depends on."""
     make: Callable[[Stage, Session, Progress], dict[str, Any]] = field(compare=False)
     """Makes the output and returns facts worth recording, e.g. its training steps."""
+    code: tuple[str, ...] = ()
+    """Parts from outside that make its output beside those in its settings, with the digests of their source."""
     reads: tuple[Path, ...] = ()
     """Versioned files that its output depends on."""
     upstream: tuple[Stage, ...] = ()
@@ -80,6 +82,8 @@ class Stage:
     def spec(self) -> dict[str, Any]:
         """Everything that determines the output beside the upstream stages, as plain data."""
         plain = {name: _plain(self.settings, name) for name in self.uses}
+        if self.code:
+            plain["code"] = self.code
         read = {path.name: digest(path) if path.exists() else None for path in self.reads}
         # through JSON, as the record is: a tuple there is a list
         data: dict[str, Any] = json.loads(json.dumps({"arm": self.arm, "seed": self.seed, **plain, **read}))

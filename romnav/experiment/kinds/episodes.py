@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,9 @@ from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
+    from romnav.evaluation.episodes import EpisodeSet
     from romnav.report.paired.gallery import EpisodeGallery
+    from romnav.world.world import World
 
 
 def episodes(work: Workspace, arm: str, seed: int) -> Stage:
@@ -33,6 +35,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(_set(work),),
+        code=driven.code,
         upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
@@ -44,9 +47,10 @@ def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
     """The episodes of every arm and training seed whose own policy is finished, and why others that were begun are not
     among them."""
     stages, left_out = [], []
-    arms = (name for experiment in work.project.experiments.values() for name in experiment.arms)
+    experiments = work.project.experiments.values()
+    arms = (name for experiment in experiments for name, arm in experiment.arms.items() if arm.trained)
     for arm in dict.fromkeys(arms):
-        for seed in work.project.seeds(arm) if work.project.driver(arm) == arm else ():
+        for seed in work.project.seeds(arm):
             trained = policy(work, arm, seed)
             if not (reason := missing(trained)):
                 stages.append(episodes(work, arm, seed))
@@ -96,18 +100,26 @@ def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
     Raises:
         RomnavError: They are missing or out of date.
     """
-    from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import rows
     from romnav.evaluation.tracks import read
     from romnav.report.paired.gallery import EpisodeGallery
 
-    stage = episodes(work, arm, seed)
-    run, path = rows.read(stage.folder / "episodes.parquet"), _set(work)
-    paired = load(path)
+    stage, path = episodes(work, arm, seed), _set(work)
+    run = rows.read(stage.folder / "episodes.parquet")
+    tracks, _ = read(stage.folder / "tracks.npz")
+    paired, world = ground(path, work.project.worlds)
     if run.provenance.episode_set != paired.digest:
         raise RomnavError(
             f"{run.source}: rows of episode set {run.provenance.episode_set}, but {path} is {paired.digest}; "
             f"run `romnav {shlex.join(stage.command)}`"
         )
-    tracks, _ = read(stage.folder / "tracks.npz")
-    return EpisodeGallery(run, tracks, paired, terrain(paired, path, work.project.worlds))
+    return EpisodeGallery(run, tracks, paired, world)
+
+
+@cache
+def ground(path: Path, worlds: Path) -> tuple[EpisodeSet, World]:
+    """The episodes of a file and their terrain, read once however many arms are looked at."""
+    from romnav.evaluation.episodes import load, terrain
+
+    paired = load(path)
+    return paired, terrain(paired, path, worlds)

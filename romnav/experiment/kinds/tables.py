@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.episodes import episodes
 from romnav.experiment.spec import SCRIPTED, Declared, suggest
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 from romnav.report.spec import PAIRED
+
+if TYPE_CHECKING:
+    from romnav.report.formats import Table
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
@@ -36,7 +40,6 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
     if not declared.tables:
         return []
     arms = [(arm, seed) for arm in experiment.arms for seed in seeds]
-    published = work.project.published(name)
     return [
         Stage(
             kind="tables",
@@ -47,7 +50,7 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             settings=declared,
             uses=("title", "labels", "tables"),
             make=partial(_write, work, name, declared),
-            reads=(published[0],) if published else (),
+            reads=work.project.published_files(name),
             upstream=tuple(episodes(work, arm, seed) for arm, seed in [*arms, *((arm, 0) for arm in SCRIPTED)]),
         )
     ]
@@ -60,12 +63,30 @@ def _write(
     from romnav.report import formats
     from romnav.report.paired import results, tables
 
-    bootstrap = Bootstrap(results.load(work.project.results, work.scale))
-    published = work.project.published(name)
+    bootstrap, published = Bootstrap(results.load(work.project.results, work.scale)), work.project.published(name)
     built = []
     for table, spec in declared.tables.items():
-        built.append(tables.build(table, spec, declared.title, bootstrap, published[1] if published else None))
+        built.append(tables.build(table, spec, declared.title, bootstrap, published))
         progress(len(built), len(declared.tables), table)
     for made in built:  # all or none
         formats.write(made, stage.folder)
     return {}
+
+
+def evaluated(work: Workspace) -> list[Table]:
+    """Every declared table of which an arm was evaluated.
+
+    Raises:
+        RomnavError: None was, or rows are unreadable or cannot be compared.
+    """
+    from romnav.evaluation.paired.statistics import Bootstrap
+    from romnav.report.paired import results, tables
+
+    bootstrap = Bootstrap(results.load(work.project.results, work.scale))
+    built = []
+    for name, experiment in work.project.experiments.items():
+        declared, published = experiment.declared(name, PAIRED), work.project.published(name)
+        for table, spec in declared.tables.items():
+            with suppress(NothingRecorded):
+                built.append(tables.build(table, spec, declared.title, bootstrap, published))
+    return built

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 from romnav.errors import NothingRecorded
 from romnav.evaluation.paired.metrics import LEVELS, METRICS, Direction, Metric, split
 from romnav.evaluation.paired.rows import HORIZONS
 from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.report.formats import Block, Cell, Row, Table, number
-from romnav.report.provenance import distinct, sources, training
-from romnav.report.spec import Column, Entry, Kind, Published, TableSpec
+from romnav.report.provenance import distinct, source, sources, training
+from romnav.report.spec import Column, Entry, Published, TableKind, TableSpec
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ COSTS = {
 """Costs of training by name."""
 
 _BY_LEVEL = tuple((f"sr_{horizon}_{level}", f"{horizon} s", level) for horizon in HORIZONS for level in LEVELS[1:])
-USUAL: dict[Kind, tuple[Column, ...]] = {
+USUAL: dict[TableKind, tuple[Column, ...]] = {
     "performance": tuple(Column(metric=metric) for metric in ("sr_45", "sr_120", "t2g", "spl")),
     "success": tuple(Column(metric=metric, header=f"{within}, {level}") for metric, within, level in _BY_LEVEL),
     "failures": tuple(Column(metric=f"{m}_{level}") for m in ("falls", "timeouts") for level in LEVELS[1:]),
@@ -48,7 +49,7 @@ _SPANS = tuple((within, len([*group])) for within, group in groupby(within for _
 _Blocks = list[tuple[Row, ...]]
 
 
-def known_metrics(kind: Kind) -> list[str]:
+def known_metrics(kind: TableKind) -> list[str]:
     """Names that a column of a kind of table may have; costs of training have no interval to contrast."""
     metrics = [m if level == "all" else f"{m}_{level}" for m in METRICS for level in LEVELS]
     return metrics if kind == "contrasts" else [*metrics, *COSTS]
@@ -141,11 +142,15 @@ def _performance(
     bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
     stated = {metric for entry in spec.entries for metric in known.get(entry.arm, ())}
     blocks = spec.rows if stated & {column.metric for column in columns} else ()
-    return _with_best((*spec.rows, bounds), columns, measured), _with_best(blocks, columns, theirs)
+    ours = _with_best((*spec.rows, bounds), columns, measured, bootstrap)
+    return ours, _with_best(blocks, columns, theirs)
 
 
 def _with_best(
-    blocks: Sequence[tuple[Entry, ...]], columns: Sequence[Column], cell: Callable[[str, Column], Cell]
+    blocks: Sequence[tuple[Entry, ...]],
+    columns: Sequence[Column],
+    cell: Callable[[str, Column], Cell],
+    measured: Bootstrap | None = None,
 ) -> _Blocks:
     """Rows of every block; bold marks a column's best shown value (and ties) among competing arms."""
     competing = [entry.arm for block in blocks for entry in block if entry.competes]
@@ -158,7 +163,16 @@ def _with_best(
         return {arm: dataclasses.replace(c, bold=shown.get(arm, math.nan) == best) for arm, c in cells.items()}
 
     made = [column_cells(column) for column in columns]
-    return [tuple(Row(e.label, tuple(cells[e.arm] for cells in made)) for e in block) for block in blocks]
+    return [
+        tuple(Row(e.label, tuple(cells[e.arm] for cells in made), _sources(measured, e.arm)) for e in block)
+        for block in blocks
+    ]
+
+
+def _sources(measured: Bootstrap | None, *arms: str) -> tuple[Mapping[str, Any], ...]:
+    """The rows of those arms that were evaluated."""
+    runs = [run for arm in arms if measured and arm in measured.arms for run in measured.arms[arm].runs]
+    return tuple(source(run.source, run.provenance) for run in runs)
 
 
 def _contrasts(
@@ -181,15 +195,21 @@ def _contrasts(
             return number(math.nan, decimals)
         return number(stated.diff, decimals, sign=True, dagger=stated.significant)
 
-    def rows(entries: Iterable[Entry], cell: Callable[[str, Column], Cell]) -> tuple[Row, ...]:
+    def rows(
+        entries: Iterable[Entry], cell: Callable[[str, Column], Cell], measured: Bootstrap | None = None
+    ) -> tuple[Row, ...]:
         return tuple(
-            Row(f"{spec.reference.label} − {entry.label}", tuple(cell(entry.arm, column) for column in columns))
+            Row(
+                f"{spec.reference.label} − {entry.label}",
+                tuple(cell(entry.arm, column) for column in columns),
+                _sources(measured, spec.reference.arm, entry.arm),
+            )
             for entry in entries
         )
 
     bounds = [entry for entry in spec.bounds if entry.arm in bootstrap.arms]
     stated = [rows(block, theirs) for block in spec.rows] if known else []
-    return [*(rows(block, measured) for block in spec.rows), rows(bounds, measured)], stated
+    return [rows(entries, measured, bootstrap) for entries in (*spec.rows, bounds)], stated
 
 
 def _provenance(

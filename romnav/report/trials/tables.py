@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from romnav.evaluation.trials.rows import TrialRows
 from romnav.evaluation.trials.statistics import (
@@ -16,7 +17,7 @@ from romnav.evaluation.trials.statistics import (
     summarise,
 )
 from romnav.report.formats import Block, Cell, Row, Table, number
-from romnav.report.provenance import sources, training
+from romnav.report.provenance import source, sources, training
 from romnav.report.spec import Published
 from romnav.world.scenes.scene import Scene
 
@@ -36,8 +37,9 @@ def safety(
         for scene in scenes:
             for filtered, arm in ARMS.items():
                 few, all_ = summarise(run, scene.name, filtered, SHARED), summarise(run, scene.name, filtered)
-                rows.append(Row(f"{scene.label}, {arm}", (*_counts(few), *_rates(all_))))
-            rows.append(Row(f"{scene.label}, CBF − no CBF", (*_dashes(3), *_differences(run, scene.name), *_dashes(1))))
+                rows.append(Row(f"{scene.label}, {arm}", (*_counts(few), *_rates(all_)), _rows(run, "safety")))
+            differences = (*_dashes(3), *_differences(run, scene.name), *_dashes(1))
+            rows.append(Row(f"{scene.label}, CBF − no CBF", differences, _rows(run, "safety")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
     if published and published.safety:
         rows = []
@@ -95,7 +97,7 @@ def deploy(
                     _share(s.falls, s.n),
                     _share(s.blocked, s.n) if filtered else number(math.nan, 1),
                 )
-                rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last)))
+                rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last), _rows(run, "deploy")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
     if published and published.deploy:
         lengths = ((scene.label, published.deploy[scene.name]) for scene in scenes if scene.name in published.deploy)
@@ -130,6 +132,10 @@ def deploy(
         blocks=tuple(blocks),
         provenance=provenance,
     )
+
+
+def _rows(run: TrialRows, kind: str) -> tuple[Mapping[str, Any], ...]:
+    return (source(f"{run.provenance.scale}/{run.arm}/seed-{run.seed}/{kind}.parquet", run.provenance),)
 
 
 def _counts(s: Summary) -> tuple[Cell, ...]:

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[3]
 def paper() -> Published:
     found = Project(ROOT, ROOT / "results").published("safety")
     assert found
-    return found[1]
+    return found
 
 
 @pytest.fixture(scope="module")
