@@ -113,8 +113,8 @@ def main() -> None:
     lasts = {stage.name: seconds(stage, Rates(given.rom, given.g1)) for stage in stages}
     lines = [
         f"Simulated: {', '.join(given.experiments)} at scale {given.scale}, {given.seeds} seeds, {len(stages)} stages. "
-        f"A core does {given.rom:g} nav-steps/s on the reduced-order model and {given.g1:g} on the humanoid. Hours, mean "
-        "and range of 50 runs.",
+        f"A core does {given.rom:g} nav-steps/s on the reduced-order model and {given.g1:g} on the humanoid. Hours, "
+        "mean and range of 50 runs.",
         "",
         "| cores | hours | range | cores at work |",
         "| --- | --- | --- | --- |",

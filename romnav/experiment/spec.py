@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import re
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
-from romnav.config import Config
+from romnav.config import Config, Label, Name, Seed
 from romnav.errors import RomnavError
 from romnav.parts import Kind
 from romnav.report.spec import PAIRED, Entry, TableKind, TableSpec
@@ -32,7 +31,7 @@ C = TypeVar("C", bound=Config)
 class Arm(Config, extra="allow"):
     """One arm: its label, and the scale's settings that it changes, e.g. ``navigation.ppo.gamma = 0.99``."""
 
-    label: str
+    label: Label
     """Name in lists."""
     policy: str | None = None
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
@@ -67,18 +66,18 @@ class Experiment(Config):
 
     kind: Literal["ablation", "safety", "deploy"]
     """What is done with the arms."""
-    title: str
+    title: Label
     """One line for lists."""
-    tables: dict[str, TableSpec] = Field(default={})
+    tables: dict[Name, TableSpec] = Field(default={})
     """Tables to write, by the name of their files; without any, the usual ones. What none of them needs is not run:
     where all are of learning curves, the arms are not evaluated."""
     reference: str = ""
     """Arm that the others are compared with; empty is the first."""
-    published: str | None = None
+    published: Name | None = None
     """Results to print beside ours: a file under experiments/published/."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """Training seeds of every arm."""
-    arms: dict[str, Arm]
+    arms: dict[Name, Arm] = Field(min_length=1)
     """Arms by the name of their results folder."""
     scales: dict[str, dict[str, Any]] = Field(default={})
     """Settings that all arms change at a scale, e.g. ``scales.paper.navigation.env.envs = 3072``."""
@@ -131,24 +130,28 @@ class Experiment(Config):
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
-            changes = arm.changes
-            if not arm.trained and changes.keys() - {"navigation"} | changes.get("navigation", {}).keys() - BODY:
+            changed = arm.changes.get("navigation", {})
+            beside = arm.changes.keys() - {"navigation"}
+            if not arm.trained and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
                 what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
                 raise ValueError(f"{name} {what}, so it can only change navigation.dynamics")
             if arm.policy and arm.driver:
                 raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
 
+    @field_validator("seeds")
+    @classmethod
+    def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
+        if twice := [value for k, value in enumerate(values) if value in values[:k]]:
+            raise ValueError(f"{twice[0]} is there twice; name it once")
+        return values
+
     @model_validator(mode="after")
     def _tables_of_its_arms(self) -> Experiment:
         known = {*self.arms, *SCRIPTED}
-        if not self.arms:
-            raise ValueError("arms: there is none")
         if self.reference and self.reference not in known:
             raise ValueError(f"reference: no arm {self.reference}{suggest(self.reference, known)}")
         for name, table in self.tables.items():
-            if not re.fullmatch(r"[\w.-]+", name):
-                raise ValueError(f"tables.{name}: files are called so; use letters, digits, - and _")
             if (table.kind == "trials") != (self.kind != "ablation"):
                 raise ValueError(f"tables.{name}.kind: {table.kind} is no table of an experiment of kind {self.kind}")
             for arm in (table.reference.arm, *(entry.arm for entry in table.entries)):
@@ -163,36 +166,51 @@ def _entries(arms: Iterable[str]) -> tuple[Entry, ...]:
     return tuple(Entry(arm=arm) for arm in arms)
 
 
-def load_experiments(folder: Path) -> dict[str, Experiment]:
+def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
     """Reads every ``<folder>/<name>.toml``.
 
-    Raises:
-        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings or two
-            tables one name.
+    Returns:
+        Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
+        no arm, or gives another arm or table a name of one before it. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
-    experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
-    drivers = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
-    seen: dict[str, tuple[str, Arm]] = {}
-    tables: dict[str, str] = {}
-    for name, experiment in experiments.items():
-        for table in experiment.declared(name, get_args(TableKind)).tables:
-            if (other := tables.setdefault(table, name)) != name:
-                raise RomnavError(f"{folder}: {other}.toml and {name}.toml both have a table {table}; rename one")
-        for scale in experiment.scales.keys() - known:
-            raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
-        for arm_name, arm in experiment.arms.items():
-            if arm.policy and arm.policy not in drivers:
-                raise RomnavError(
-                    f"{folder / name}.toml: arms.{arm_name}.policy: no arm {arm.policy} that is trained"
-                    f"{suggest(arm.policy, drivers)}"
-                )
-            first, same = seen.setdefault(arm_name, (name, arm))
-            if (same.changes, same.driver, experiments[first].scales) != (arm.changes, arm.driver, experiment.scales):
-                raise RomnavError(
-                    f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
-                )
-    return experiments
+    read: dict[str, Experiment] = {}
+    wrong: dict[str, RomnavError] = {}
+    for file in sorted(folder.glob("*.toml")):
+        try:
+            read[file.stem] = parse(Experiment, read_toml(file), file)
+        except RomnavError as error:
+            wrong[file.stem] = error
+    drivers = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
+    whole = not wrong  # an arm that is missed may be in what could not be read
+    experiments: dict[str, Experiment] = {}
+    for name, experiment in read.items():
+        if fault := _fault(name, experiment, experiments, known, drivers if whole else None):
+            wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
+        else:
+            experiments[name] = experiment
+    return experiments, wrong
+
+
+def _fault(
+    name: str, experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
+) -> str | None:
+    """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
+    for scale in experiment.scales.keys() - scales:
+        return f"scales: unknown scale {scale}{suggest(scale, scales)}"
+    every = get_args(TableKind)
+    for table in experiment.declared(name, every).tables:
+        for first, other in before.items():
+            if table in other.declared(first, every).tables:
+                return f"tables.{table}: {first}.toml has a table of this name; rename one"
+    for arm_name, arm in experiment.arms.items():
+        if arm.policy and drivers is not None and arm.policy not in drivers:
+            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
+        for first, other in before.items():
+            same = other.arms.get(arm_name)
+            if same and (same.changes, same.driver, other.scales) != (arm.changes, arm.driver, experiment.scales):
+                return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
+    return None
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -202,7 +220,7 @@ def read_toml(file: Path) -> dict[str, Any]:
         RomnavError: It is missing or no TOML.
     """
     try:
-        return tomllib.loads(file.read_text("utf-8"))
+        return tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
         raise RomnavError(f"{file}: cannot be read ({(error.strerror or str(error)).lower()})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -220,7 +238,7 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
         return model.model_validate_json(json.dumps(data, default=str))
     except ValidationError as invalid:
         error = invalid.errors()[0]
-        key = prefix + ".".join(map(str, error["loc"]))
+        key = (prefix + ".".join(str(part) for part in error["loc"] if part != "[key]")).rstrip(".")
         raise RomnavError(f"{file}: {_explain(model, key, error)}") from invalid
 
 

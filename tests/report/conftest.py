@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from romnav.errors import NothingRecorded
 from romnav.evaluation import episodes, tracks
 from romnav.evaluation.paired import rows
 from romnav.evaluation.paired.run import run
@@ -31,14 +29,14 @@ Walk = Callable[[int], dict[str, EpisodeGallery]]
 
 @pytest.fixture(scope="session")
 def papers_tables() -> Callable[[Sequence[rows.Arm]], dict[str, Table]]:
-    """Makes the paper's tables of paired episodes of some arms, as far as they go."""
+    """Makes those of the paper's tables of paired episodes that compare some of these arms."""
 
     def build(arms: Sequence[rows.Arm]) -> dict[str, Table]:
         bootstrap, made = Bootstrap(arms), {}
         for experiment in ("spawn-goal", "kickstart"):
             declared = PAPER.experiment(experiment).declared(experiment, PAIRED)
             for name, spec in declared.tables.items():
-                with suppress(NothingRecorded):
+                if len(tables.evaluated(spec, bootstrap)) > 1:
                     made[name] = tables.build(name, spec, declared.title, bootstrap, PAPER.published(experiment))
         return made
 

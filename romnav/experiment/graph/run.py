@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
@@ -52,7 +53,7 @@ def require(stage: Stage, reader: Stage) -> None:
         RomnavError: It is not, or was made with other settings.
     """
     if reason := missing(stage):
-        command = " ".join(("romnav", *stage.command))
+        command = shlex.join(("romnav", *stage.command))
         raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
 
 
@@ -91,6 +92,17 @@ def waves(stages: Iterable[Stage]) -> list[list[Stage]]:
         groups += [[] for _ in range(level + 1 - len(groups))]
         groups[level].append(stage)
     return groups
+
+
+def prepare(stages: Iterable[Stage]) -> None:
+    """Makes sure that what stages will write can be written, which is better known before the first one than after it.
+
+    Raises:
+        RomnavError: A file cannot be written.
+    """
+    for stage in stages:
+        for path in (*(stage.folder / name for name in stage.outputs), stage.record):
+            files.prepare(path)
 
 
 def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None] = lambda line: None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,6 +33,8 @@ class Session:
     def __post_init__(self) -> None:
         if self.device == "cpu":
             return
+        if not re.fullmatch(r"cuda(:\d+)?", self.device):
+            raise RomnavError(f"device {self.device}: there is none of this name; use cpu, cuda or cuda:N")
         import torch
 
         try:

@@ -74,7 +74,7 @@ def _write(
 
 
 def evaluated(work: Workspace) -> list[Table]:
-    """Every declared table of which an arm was evaluated.
+    """Every declared table of which at least two arms were evaluated.
 
     Raises:
         RomnavError: None was, or rows are unreadable or cannot be compared.
@@ -87,6 +87,8 @@ def evaluated(work: Workspace) -> list[Table]:
     for name, experiment in work.project.experiments.items():
         declared, published = experiment.declared(name, PAIRED), work.project.published(name)
         for table, spec in declared.tables.items():
-            with suppress(NothingRecorded):
+            if len(tables.evaluated(spec, bootstrap)) < 2:
+                continue
+            with suppress(NothingRecorded):  # bounds alone
                 built.append(tables.build(table, spec, declared.title, bootstrap, published))
     return built

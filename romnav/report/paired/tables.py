@@ -98,6 +98,18 @@ def build(name: str, spec: TableSpec, title: str, bootstrap: Bootstrap, publishe
     return Table(name, caption, spans, headers, tuple(column.metric for column in columns), blocks, provenance)
 
 
+def evaluated(spec: TableSpec, bootstrap: Bootstrap) -> list[str]:
+    """The arms of a table that were evaluated."""
+    arms = dict.fromkeys(entry.arm for entry in (*_compared(spec), *spec.bounds))
+    return [arm for arm in arms if arm in bootstrap.arms]
+
+
+def _compared(spec: TableSpec) -> list[Entry]:
+    """All but the bounds."""
+    rows = [entry for block in spec.rows for entry in block]
+    return [spec.reference, *rows] if spec.kind == "contrasts" else rows
+
+
 def _header(metric: str) -> str:
     level, meant = split(metric)[1], meaning(metric)
     label = meant.label if level == "all" else f"{meant.label}, {level}"
@@ -216,12 +228,10 @@ def _provenance(
     name: str, spec: TableSpec, bootstrap: Bootstrap, published: Published | None
 ) -> tuple[dict[str, str], str]:
     """Provenance of the evaluated arms of a table, and the end of its caption that states it."""
-    rows = [entry for block in spec.rows for entry in block]
-    compared = [spec.reference, *rows] if spec.kind == "contrasts" else rows
+    compared = _compared(spec)
     if not any(entry.arm in bootstrap.arms for entry in compared):
         raise NothingRecorded(f"table {name}: no arm of it was evaluated; evaluate {compared[0].arm} first")
-    arms = dict.fromkeys(entry.arm for entry in (*compared, *spec.bounds))
-    shown = [bootstrap.arms[arm] for arm in arms if arm in bootstrap.arms]
+    shown = [bootstrap.arms[arm] for arm in evaluated(spec, bootstrap)]
     runs = [run for arm in shown for run in arm.runs]
     files = [run.provenance for run in runs]
     facts = sources(files)
