@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from romnav.cli.app import describe
-from romnav.cli.options import AtScale, command, experiments
+from romnav.cli.options import AtScale, command, experiments, scales
 from romnav.cli.printing import print_table
 
 SAMPLER_COLUMNS = {
@@ -50,6 +50,28 @@ def world(
         print_table("Goals drawn from uniform starts; shares of 1", rows, SAMPLER_COLUMNS)
         typer.echo("\n".join(_lines(told)))
     typer.echo(path, err=True)
+
+
+@command(describe, "scale")
+def scale(
+    at: AtScale,
+    name: Annotated[str, typer.Argument(help="Scale, see experiments/scales/.", autocompletion=scales)],
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON, for scripts.")] = False,
+) -> None:
+    """Tell what a training run on the reduced-order model takes of memory at a scale, before it starts."""
+    from romnav.experiment.memory import footprint
+    from romnav.experiment.workspace import Workspace
+
+    settings = Workspace(at.project, name).settings
+    parts = footprint(settings)
+    if as_json:
+        typer.echo(json.dumps(parts, indent=2))
+        return
+    spec = settings.navigation
+    rows = [{"part": part, "mb": f"{size:,.1f}"} for part, size in parts.items()]
+    print_table(f"Memory of {name}", rows, {"part": "part", "mb": "MB"})
+    typer.echo(f"{spec.env.envs:,} robots x {spec.ppo.steps} steps, {settings.world.tiles} tiles")
+    typer.echo("activations of an update are not counted")
 
 
 def _lines(told: dict[str, Any]) -> list[str]:

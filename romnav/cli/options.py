@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -113,8 +113,14 @@ class Job(AtScale):
         stages = run.pending(targets, repeated)
         if not stages:
             _say("nothing to do: everything is finished and up to date")
-        execute = launch.execute_side_by_side if side_by_side and self.device == "cpu" else run.execute
+        execute = self._engine()
+        if not execute:
+            execute = launch.execute_side_by_side if side_by_side and self.device == "cpu" else run.execute
         execute(stages, session, _say)
+
+    def _engine(self) -> Callable[[Iterable[Stage], Session, Callable[[str], None]], None] | None:
+        """What runs stages elsewhere, if it is not this machine."""
+        return None
 
     def draw(self, reports: Sequence[Stage]) -> None:
         """Writes the reports that are out of date, or all without ``resume``, from what is recorded."""
@@ -142,6 +148,19 @@ class RunJob(DeviceJob):
     listed: Annotated[
         bool, typer.Option("--print", help="Print what would run as shell commands with their order, and run nothing.")
     ] = False
+
+    on: Annotated[
+        str | None, typer.Option("--on", help="Run the stages on a Ray cluster: ray, or ray://host:port.")
+    ] = None
+
+    def _engine(self) -> Callable[[Iterable[Stage], Session, Callable[[str], None]], None] | None:
+        if self.on is None:
+            return None
+        from romnav.experiment.graph.cluster import execute_on_ray
+
+        share = self.work.settings.resources
+        needs = {"num_cpus": share.cores, "num_gpus": share.gpus, "memory": share.memory_gb * 1e9}
+        return functools.partial(execute_on_ray, self.on, needs)
 
     def tell(self, targets: Sequence[Stage], again: Sequence[Stage], *words: str) -> None:
         """Prints the commands of what `make` would run, then that with these ``words``, for a cluster's queue."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from romnav import parts
 from romnav.errors import RomnavError
 from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, suggest
 
@@ -29,6 +30,7 @@ class Project:
         folder = Path.cwd()
         for root in (folder, *folder.parents):
             if (root / "experiments" / "scales").is_dir():
+                parts.search(root)
                 return cls(root, results or root / "results")
         raise RomnavError(f"{folder}: no experiments/ here or above; change to a copy of the romnav repository")
 
@@ -80,9 +82,18 @@ class Project:
         """
         return arm if arm in SCRIPTED else self.having(arm)[1].driver(arm)
 
+    def script(self, arm: str) -> str | None:
+        """The scripted driver of an arm that has one in place of a policy.
+
+        Raises:
+            RomnavError: There is no such arm.
+        """
+        driver = self.driver(arm)
+        return driver if driver in SCRIPTED else self.having(driver)[1].arms[driver].driver
+
     def seeds(self, arm: str) -> tuple[int, ...]:
         """Training seeds of an arm; a scripted one has only seed 0."""
-        return (0,) if self.driver(arm) in SCRIPTED else self.having(arm)[1].seeds
+        return (0,) if self.script(arm) else self.having(arm)[1].seeds
 
     def overview(self) -> str:
         """Experiments, arms, and the training seeds evaluated at each scale, as text."""

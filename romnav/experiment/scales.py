@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
@@ -14,6 +16,17 @@ from romnav.navigation.spec import KickstartSpec, NavigationSpec
 from romnav.robot.spec import LocomotionSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
+
+
+class ResourcesSpec(Config):
+    """What a stage takes of a cluster's machine."""
+
+    cores: int = Field(default=1, ge=1)
+    """Cores: training runs on one thread."""
+    gpus: float = Field(default=0.0, ge=0.0)
+    """Share of a GPU, with ``--device cuda``."""
+    memory_gb: float = Field(default=3.0, gt=0.0)
+    """Memory (A: measured on a core, see docs/scale.md; `romnav describe scale` tells the largest parts)."""
 
 
 class Scale(Config):
@@ -43,6 +56,8 @@ class Scale(Config):
     """Trials in the obstacle sets."""
     deploy: DeploymentSpec = DeploymentSpec()
     """Trials in the deployments."""
+    resources: ResourcesSpec = ResourcesSpec()
+    """Share of a machine that a stage takes on a cluster."""
 
     def on_body(self, dynamics: str) -> Scale:
         """The same with robots of another body."""

@@ -7,15 +7,17 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from romnav.config import Config
 from romnav.errors import RomnavError
+from romnav.parts import Kind
 
 SCRIPTED = ("oracle", "straight")
 """Arms that need no training; every ablation is evaluated beside them."""
+DRIVERS = Kind("scripted driver", "romnav.drivers", "romnav.evaluation.rollout:Driver")
 RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
 """Names of other folders beside those of the arms: figures, and one for a kind of stage."""
 
@@ -32,11 +34,18 @@ class Arm(Config, extra="allow"):
     """Name in lists."""
     policy: str | None = None
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
+    driver: Annotated[str, DRIVERS] | None = Field(default=None, exclude_if=lambda driver: driver is None)
+    """Scripted driver from outside that it has in place of a policy, e.g. "pkg.mod:Name"."""
 
     @property
     def changes(self) -> dict[str, Any]:
         """Settings that differ from the scale's, nested by section."""
         return self.model_extra or {}
+
+    @property
+    def trained(self) -> bool:
+        """Whether it has a policy of its own."""
+        return not (self.policy or self.driver)
 
 
 TrialKind = Literal["safety", "deploy"]
@@ -76,8 +85,12 @@ class Experiment(Config):
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
-            if arm.policy and arm.changes.keys() - {"navigation"} | arm.changes.get("navigation", {}).keys() - BODY:
-                raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
+            changes = arm.changes
+            if not arm.trained and changes.keys() - {"navigation"} | changes.get("navigation", {}).keys() - BODY:
+                what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
+                raise ValueError(f"{name} {what}, so it can only change navigation.dynamics")
+            if arm.policy and arm.driver:
+                raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
 
 
@@ -89,19 +102,19 @@ def load_experiments(folder: Path) -> dict[str, Experiment]:
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
     experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
-    trained = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
+    drivers = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
     seen: dict[str, tuple[str, Arm]] = {}
     for name, experiment in experiments.items():
         for scale in experiment.scales.keys() - known:
             raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
         for arm_name, arm in experiment.arms.items():
-            if arm.policy and arm.policy not in trained:
+            if arm.policy and arm.policy not in drivers:
                 raise RomnavError(
                     f"{folder / name}.toml: arms.{arm_name}.policy: no arm {arm.policy} that is trained"
-                    f"{suggest(arm.policy, trained)}"
+                    f"{suggest(arm.policy, drivers)}"
                 )
             first, same = seen.setdefault(arm_name, (name, arm))
-            if (same.changes, experiments[first].scales) != (arm.changes, experiment.scales):
+            if (same.changes, same.driver, experiments[first].scales) != (arm.changes, arm.driver, experiment.scales):
                 raise RomnavError(
                     f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
                 )

@@ -3,50 +3,23 @@
 from __future__ import annotations
 
 import copy
-import io
-import pickle
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import torch
 from pydantic import ValidationError
 from tensordict import TensorDict
 
-from romnav import files
+from romnav import parts
 from romnav.errors import RomnavError
 from romnav.navigation.policy import BEARING, NavigationActor
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.encoder import Encoder
+from romnav.tensors import Kind
 
-FORMAT = "romnav-policy-1"
-TORN = (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
-
-
-def save(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` in one step."""
-    buffer = io.BytesIO()
-    torch.save({"format": FORMAT, **content}, buffer)
-    with files.atomic(path) as file:
-        file.write(buffer.getvalue())
-
-
-def read(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """Content of a policy or training checkpoint.
-
-    Raises:
-        RomnavError: The file is missing, torn or no policy.
-    """
-    try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise RomnavError(f"{path}: no such policy; train it by `romnav train policy ARM`") from None
-    except TORN as error:
-        raise RomnavError(f"{path}: truncated or no checkpoint; delete it and train the arm again") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise RomnavError(f"{path}: key 'format' is not {FORMAT!r}; delete it and train the arm again")
-    return content
+KIND = Kind("romnav-policy-1", "policy", "train the arm by `romnav train policy`")
+"""Policies, and the states of unfinished runs."""
+save, read = KIND.save, KIND.load
 
 
 def load_actor(
@@ -73,7 +46,7 @@ def load_actor(
     if has_depth and depth_encoder is None:
         raise RomnavError(f"{path}: the policy sees through a depth camera; drive it on the humanoid that has one")
     try:
-        spec = NavigationSpec.model_validate_json(content["spec"])
+        spec = NavigationSpec.model_validate_json(content["spec"], context=parts.SAVED)
         state = content["actor"]["state_embedding.0.weight"].shape[1] - BEARING
         seen = {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, state)}
         if has_depth and depth_encoder is not None:
@@ -82,7 +55,10 @@ def load_actor(
         if own:
             actor.encoder = copy.deepcopy(encoder)
         actor.load_state_dict(content["actor"])
-    except (RuntimeError, ValidationError) as error:
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RomnavError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}; train the arm again") from error
+    except RuntimeError as error:
         reason = str(error).splitlines()[1].strip()
         raise RomnavError(f"{path}: a policy of another architecture ({reason}); train the arm again") from error
     return actor.to(device).eval()

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from romnav.config import Config
+from romnav.parts import Kind
 from romnav.sensing.spec import CorruptionSpec
 from romnav.world.spec import SamplerSpec
+
+REWARDS = Kind("reward term", "romnav.rewards", "romnav.navigation.rewards:Term")
+NETWORKS = Kind("policy network", "romnav.networks", "romnav.navigation.policy:NavigationActor", called=False)
+BODIES = Kind("body", "romnav.bodies", "romnav.robot.dynamics:Dynamics", builtin=("rom", "g1"), called=False)
 
 
 class CommandSpec(Config):
@@ -53,6 +58,8 @@ class RewardSpec(Config):
     """Vertical speed that earns the full height progress, m/s (A: a flight of stairs at half of the top speed)."""
     scale: float = 0.2
     """Common factor, s (A: the control period, so that returns are integrals over time)."""
+    terms: dict[Annotated[str, REWARDS], float] = Field(default={}, exclude_if=lambda terms: not terms)
+    """Weights of terms from outside, by "pkg.mod:Name"."""
 
 
 class EnvSpec(Config):
@@ -95,6 +102,13 @@ class PolicySpec(Config):
     """Width of the dense layer before the Beta parameters (A)."""
     critic: tuple[int, ...] = (128, 128)
     """Hidden widths of the privileged critic (A)."""
+    network: Annotated[str, NETWORKS] | None = Field(default=None, exclude_if=lambda network: network is None)
+    """Policy network from outside, "pkg.mod:Name"."""
+
+    @property
+    def visual(self) -> int:
+        """Number of features that the network makes of the tokens."""
+        return (self.queries + 1) * self.attention
 
 
 class EncoderUseSpec(Config):
@@ -198,8 +212,9 @@ class KickstartSpec(Config):
 class NavigationSpec(Config):
     """Everything that the navigation stage needs beside world, sensors and encoder."""
 
-    dynamics: Literal["rom", "g1"] = "rom"
-    """The body that is driven: the reduced-order model, or the humanoid under its frozen locomotion policy."""
+    dynamics: Annotated[str, BODIES] = "rom"
+    """The body that is driven: the reduced-order model, "g1", the humanoid under its frozen locomotion policy, or one
+    from outside, "pkg.mod:Name"."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -139,10 +140,17 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def tabulate(name: str, title: str, arms: Mapping[str, Curves], provenance: dict[str, str]) -> Table:
-    """Final success and iteration time of every arm; times are relative to the first arm's frozen iterations."""
+def tabulate(
+    name: str,
+    title: str,
+    arms: Mapping[str, Curves],
+    provenance: dict[str, str],
+    sources: Mapping[str, tuple[Mapping[str, Any], ...]],
+) -> Table:
+    """Final success and iteration time of every arm, with what their runs come from; times are relative to the first
+    arm's frozen iterations."""
     reference = next(iter(arms.values())).iteration_time(unfrozen=False)
-    ours = tuple(Row(curves.label, _cells(curves, reference)) for curves in arms.values())
+    ours = tuple(Row(curves.label, _cells(curves, reference), sources[arm]) for arm, curves in arms.items())
     dash = number(math.nan, 1)
     factors = {arms[arm].label: factor for arm, factor in paper.ITERATION_TIME.items() if arm in arms}
     published = tuple(Row(label, (dash, dash, number(factor, 2))) for label, factor in factors.items())

@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from romnav import files
 
@@ -33,10 +34,11 @@ def number(value: float, decimals: int, *, sign: bool = False, dagger: bool = Fa
 
 @dataclass(frozen=True)
 class Row:
-    """A labelled row of numbers."""
+    """A labelled row of numbers, and the files that they are made of with their provenance, for the report."""
 
     label: str
     cells: tuple[Cell, ...]
+    sources: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -288,7 +288,7 @@ class Humanoids(Robots):
         part = copy.copy(self)
         part.count, part.ground = len(ids), self.ground[ids]
         part._open()
-        part.load_state_dict({name: value[ids.numpy()] for name, value in self.state_dict().items()})
+        part.load_state_dict({name: value[ids] for name, value in self.state_dict().items()})
         return part
 
     def _derive(self, ids: NDArray | None = None) -> None:
@@ -349,21 +349,16 @@ class Humanoids(Robots):
         self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
         self.batch.set_const()
 
-    def state_dict(self) -> dict[str, NDArray]:
+    def state_dict(self) -> dict[str, Tensor]:
         """All that decides the future: MuJoCo's integration state and the last contacts."""
         names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
-        return {name: getattr(self.batch, name).copy() for name in names} | {
-            "touch": self.touch.numpy().copy(), "torque": self.torque.numpy().copy(), "lost": self.lost.numpy().copy(),
+        return {name: torch.from_numpy(getattr(self.batch, name).copy()) for name in names} | {
+            "touch": self.touch.clone(), "torque": self.torque.clone(), "lost": self.lost.clone(),
         }  # fmt: skip
 
-    def load_state_dict(self, state: dict[str, NDArray]) -> None:
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state_dict`."""
         for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
-            getattr(self.batch, name)[:] = state[name]
-        self.touch, self.torque = (
-            torch.from_numpy(state["touch"].copy()),
-            torch.from_numpy(state["torque"].copy()),
-        )
-        if "lost" in state:
-            self.lost = torch.from_numpy(state["lost"].copy())
+            getattr(self.batch, name)[:] = state[name].numpy()
+        self.touch, self.torque, self.lost = (state[name].clone() for name in ("touch", "torque", "lost"))
         self._derive()

@@ -16,7 +16,9 @@ from romnav.robot.locomotion.lip import turn_xy, wrap
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.terrain import Ground, Lane, Slab, ramp, stairs, steer
 from romnav.robot.locomotion.train import load_policy
+from romnav.tensors import Kind
 
+KIND = Kind("romnav-gaits-1", "gait library", "record one with `romnav train gaits`")
 COMMAND = 0.5
 """Standard command along the slope, m/s."""
 _POINTS = ("lift", "foothold", "planted")
@@ -111,18 +113,16 @@ class GaitLibrary:
 
     def save(self, path: Path) -> None:
         """Write all gaits to one file."""
-        torch.save([vars(gait) for gait in self.gaits], path)
+        KIND.save(path, {"gaits": [vars(gait) for gait in self.gaits]})
 
     @classmethod
     def load(cls, path: Path) -> GaitLibrary:
         """Read what `save` wrote.
 
         Raises:
-            RomnavError: the file is missing.
+            RomnavError: the file is missing, damaged or no gait library.
         """
-        if not path.exists():
-            raise RomnavError(f"{path}: no gait library; record one with `romnav train gaits`")
-        return cls([Gait(**fields) for fields in torch.load(path)])
+        return cls([Gait(**fields) for fields in KIND.load(path)["gaits"]])
 
 
 def library_lanes() -> list[Lane]:

@@ -227,7 +227,7 @@ class Humanoid:
     def state_dict(self) -> dict[str, Any]:
         """Everything that changes while stepping."""
         own = {name: getattr(self, name).clone() for name in _STATE}
-        physics = {f"physics.{name}": torch.from_numpy(value) for name, value in self.robots.state_dict().items()}
+        physics = {f"physics.{name}": value for name, value in self.robots.state_dict().items()}
         walker = self.control.snapshot(torch.arange(len(self.tile)))
         return own | physics | {f"walker.{name}": value for name, value in walker.items()}
 
@@ -243,4 +243,4 @@ class Humanoid:
                 parts[part][key] = value
         self.control.restore(torch.arange(len(self.tile)), parts["walker"])
         # After `restore`, which forgets contacts and the solver's warm start.
-        self.robots.load_state_dict({name: value.numpy() for name, value in parts["physics"].items()})
+        self.robots.load_state_dict(parts["physics"])

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import math
-import pickle
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,16 +11,17 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from romnav import files
 from romnav.errors import RomnavError
 from romnav.precision import product_dtype, reduced_precision
 from romnav.sensing.spec import EncoderSpec
+from romnav.tensors import Kind
 from romnav.world.solids import Label
 
-FORMAT = "romnav-encoder-1"
 LOGIT = 10.0
 """Size of a logit that is 1 before scaling: lets the masks learn at the pace of the lengths."""
-AGAIN = "run `romnav train encoder` again"
+AGAIN = "run `romnav train encoder`"
+KIND = Kind("romnav-encoder-1", "encoder checkpoint", AGAIN)
+read = KIND.load
 
 
 class Encoder(nn.Module):
@@ -169,33 +167,13 @@ def untrained(spec: EncoderSpec, directions: Tensor, seed: int) -> Autoencoder:
 
 def save(path: Path, model: Autoencoder, extra: dict[str, Any] | None = None) -> None:
     """Write a checkpoint in one step; ``extra`` is whatever its writer needs to go on."""
-    buffer = io.BytesIO()
     content = {
-        "format": FORMAT,
         "spec": model.encoder.spec.model_dump_json(),
         "directions": model.encoder.directions,
         "weights": model.state_dict(),
         **(extra or {}),
     }
-    torch.save(content, buffer)
-    files.write(path, buffer.getvalue())
-
-
-def read(path: Path) -> dict[str, Any]:
-    """Content of a checkpoint.
-
-    Raises:
-        RomnavError: The file is missing, torn or no encoder checkpoint.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise RomnavError(f"{path}: no such encoder checkpoint; make it by `romnav train encoder`") from None
-    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
-        raise RomnavError(f"{path}: truncated or no checkpoint; delete it and {AGAIN}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise RomnavError(f"{path}: key 'format' is not {FORMAT!r}; {AGAIN}")
-    return content
+    KIND.save(path, content)
 
 
 def load_autoencoder(path: Path, device: str = "cpu") -> Autoencoder:

@@ -160,6 +160,9 @@ def pretrain(
 
     Returns:
         Path of the checkpoint.
+
+    Raises:
+        RomnavError: What an earlier run left is damaged; a term of the loss is not finite; ``out`` cannot be written.
     """
     path, state_path = out / "encoder.pt", out / "state.pt"
     poses = Poses([grids for _, grids in tiles], height, spec.seed, device)
@@ -248,11 +251,8 @@ class _Training:
         checkpoints.save(path, self.model, extra)
 
     def restore(self, path: Path) -> None:
-        """Go on from a state of the same spec; one of another spec, or a torn one, will be replaced."""
-        try:
-            content = checkpoints.read(path)
-        except RomnavError:
-            return
+        """Go on from a state of the same spec; one of another spec will be replaced."""
+        content = checkpoints.read(path)
         if content.get("key") != self._key:
             return
         self.model.load_state_dict(content["weights"])
@@ -300,7 +300,7 @@ def quality(
         and all of it in ``dropout_50``.
     """
     poses = Poses([grids for _, grids in tiles], height, seed, device)
-    kinds = np.array([tile.kind.value for tile, _ in tiles])
+    kinds = np.array([tile.kind for tile, _ in tiles])
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
         corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)

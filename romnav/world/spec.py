@@ -8,10 +8,12 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from romnav.config import Config
+from romnav.parts import Kind
 
-TileName = Literal["building", "outdoor", "room"]
-SMALLEST: dict[TileName, float] = {"building": 12.0, "outdoor": 20.0, "room": 10.0}
+SMALLEST = {"building": 12.0, "outdoor": 20.0, "room": 10.0}
 """Least side at which the generator of a class finds room for what belongs to it, m."""
+TILES = Kind("tile class", "romnav.tiles", "romnav.world.tile:TileGenerator", builtin=tuple(SMALLEST))
+TileName = Annotated[str, TILES]
 LARGEST = 100.0
 """Largest side, m: geodesics are kept up to 255 m."""
 DOORWAY = 1.2
@@ -55,7 +57,8 @@ class WorldSpec(Config):
     side: float = Field(default=40.0, ge=min(SMALLEST.values()), le=LARGEST)
     """Tile side, m (A: beyond the paper's cap of 30 m, so that the caps differ and stairs are to be searched for)."""
     classes: tuple[TileName, ...] = Field(default=("building", "outdoor", "building", "room"), min_length=1)
-    """Tile classes in turn (A: half of the tiles are multi-story, where the paper's question lies)."""
+    """Tile classes in turn, one from outside as "pkg.mod:Name" (A: half of the tiles are multi-story, where the paper's
+    question lies)."""
     riser: Range = (0.10, 0.18)
     """Range of stair risers, m (A)."""
     tread: Range = (0.26, 0.32)
@@ -79,8 +82,9 @@ class WorldSpec(Config):
         """Why no generator could build this, and what to change."""
         cell, step, radius = self.grid.cell, self.grid.max_step, self.grid.robot_radius
         for name in dict.fromkeys(self.classes):
-            if self.side < SMALLEST[name]:
-                return f"side: {self.side} m; a tile of class {name} takes {SMALLEST[name]} m or more"
+            smallest = SMALLEST.get(name) or TILES.load(name).smallest
+            if self.side < smallest:
+                return f"side: {self.side} m; a tile of class {name} takes {smallest} m or more"
         cells = self.side / cell
         if cells > MOST_CELLS:
             return f"grid.cell: {self.side} m are {cells:.0f} cells of {cell} m; {MOST_CELLS} are the most, widen it"

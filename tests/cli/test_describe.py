@@ -6,8 +6,17 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
+from romnav.experiment.scales import ScaleFile
+from romnav.navigation.env import NavigationEnv
+from romnav.navigation.ppo import make_ppo
+from romnav.robot.rom import ReducedOrderModel
+from romnav.sensing.encoder import Autoencoder
+from romnav.sensing.lidar import Lidar
+from romnav.world.build import build
 from tests.cli.conftest import ROOT, edit, fails, romnav
+from tests.navigation.conftest import FakePerception
 
 
 @pytest.fixture
@@ -58,3 +67,29 @@ def test_arms_on_other_terrain_have_no_one_world(small: Path) -> None:
     file = small / "experiments" / "spawn-goal.toml"
     edit(file, "[arms.nocap]", "[arms.nocap]\nworld.seed = 4")
     assert "arms.nocap.world differs" in fails("describe", "world", "--scale", "mine")
+
+
+def test_memory_of_a_scale_is_that_of_the_run(small: Path) -> None:
+    """A rollout as training fills it, with other robots than those that the description makes."""
+    told = json.loads(romnav("describe", "scale", "mine", "--json").stdout)
+    assert "512 robots x 32 steps, 3 tiles" in romnav("describe", "scale", "mine").stdout
+    settings = ScaleFile(small / "experiments" / "scales", "mine").settings
+    spec, tokens = settings.navigation, settings.pretrain.encoder
+    world = build(settings.world)
+    assert told["world"] == pytest.approx(sum(v.nbytes for v in vars(world).values() if hasattr(v, "nbytes")) / 1e6)
+    env = NavigationEnv(world, ReducedOrderModel(world, 512, 0.2), FakePerception(), spec.env, 0, "cpu")
+    obs = env.get_observations()
+    lidar = Lidar([tile.solids for tile in world.tiles], settings.lidar)
+    encoder = Autoencoder(tokens, lidar.directions).encoder
+    seen = encoder(torch.zeros(1, settings.lidar.rows, settings.lidar.columns)).to(torch.bfloat16)
+    obs["lidar"] = seen.expand(512, *seen.shape[1:]).contiguous()
+    ppo = make_ppo(obs, spec.policy, spec.ppo, 512, "cpu")
+    ppo.train_mode()
+    with torch.inference_mode():
+        ppo.act(obs)
+        ppo.process_env_step(obs, torch.zeros(512), torch.zeros(512), {})
+    stored = vars(ppo.storage)
+    tensors = [value for value in stored.values() if isinstance(value, torch.Tensor)]
+    tensors += [*ppo.storage.observations.values(), *ppo.storage.distribution_params]
+    kept = {tensor.data_ptr(): tensor.nbytes for tensor in tensors}
+    assert told["rollout"] == pytest.approx(sum(kept.values()) / 1e6, rel=0.05)

@@ -17,7 +17,7 @@ def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> Non
     assert fails("eval", "locomotion") == (
         f"{folder}: locomotion is missing, and terrain test needs it; run `romnav train locomotion --scale smoke`"
     )
-    assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no locomotion policy; train one with")
+    assert fails("play", "locomotion").startswith(f"{folder / 'policy.pt'}: no such locomotion policy; train one with")
 
 
 def test_the_navigation_test_is_of_the_locomotion_policy_and_needs_rom(project: Path) -> None:

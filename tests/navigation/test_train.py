@@ -275,13 +275,13 @@ def test_policy_errors_name_file_and_fix(
     checkpoint.save(tmp_path / "renamed.pt", {**checkpoint.read(path), "encoder": other.digest()})
     with pytest.raises(RomnavError, match=r"renamed\.pt: a policy of another architecture .*attention\.embed"):
         checkpoint.load_actor(tmp_path / "renamed.pt", other)
-    with pytest.raises(RomnavError, match=r"none\.pt: no such policy; train it"):
+    with pytest.raises(RomnavError, match=r"none\.pt: no such policy; train the arm"):
         checkpoint.read(tmp_path / "none.pt")
     content = path.read_bytes()
     for cut in (0, 10, len(content) // 2, len(content) - 1):
         torn = tmp_path / "torn.pt"
         torn.write_bytes(content[:cut])
-        with pytest.raises(RomnavError, match=r"torn\.pt: truncated or no checkpoint"):
+        with pytest.raises(RomnavError, match=r"torn\.pt: damaged, or no policy"):
             checkpoint.read(torn)
     torch.save({"weights": 1}, tmp_path / "foreign.pt")
     with pytest.raises(RomnavError, match="key 'format' is not"):

@@ -74,5 +74,5 @@ def test_lookup_takes_the_nearest_slope_and_survives_a_file(walking: tuple, tmp_
     assert len(loaded.nearest("ramp", -1, 0.9)) == 1
     with pytest.raises(RomnavError, match="no walk down a stair"):
         loaded.nearest("stair", -1, 0.5)
-    with pytest.raises(RomnavError, match="no gait library"):
+    with pytest.raises(RomnavError, match="no such gait library"):
         GaitLibrary.load(tmp_path / "none.pt")

@@ -105,7 +105,7 @@ def test_a_checkpoint_restores_the_encoder(tmp_path: Path) -> None:
 
 
 def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RomnavError, match=r"gone\.pt: no such encoder checkpoint; make it by"):
+    with pytest.raises(RomnavError, match=r"gone\.pt: no such encoder checkpoint; run `romnav train encoder`"):
         checkpoints.load(tmp_path / "gone.pt")
 
 
@@ -113,7 +113,7 @@ def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
 def test_a_truncated_checkpoint_is_named(checkpoint: Path, keep: float) -> None:
     data = checkpoint.read_bytes()
     checkpoint.write_bytes(data[: int(keep * len(data))])
-    with pytest.raises(RomnavError, match=r"encoder\.pt: truncated"):
+    with pytest.raises(RomnavError, match=r"encoder\.pt: damaged"):
         checkpoints.load(checkpoint)
 
 

@@ -142,14 +142,14 @@ class Controller:
     def state_dict(self) -> dict[str, Any]:
         """State besides the robots'."""
         return {name: getattr(self.walker, name).clone() for name in Walker.STATE} | {
-            "action": self.action.clone(), "reference": self.reference,
+            "action": self.action.clone(), "reference": dict(vars(self.reference)),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name in Walker.STATE:
             setattr(self.walker, name, state[name].clone())
-        self.action, self.reference = state["action"].clone(), state["reference"]
+        self.action, self.reference = state["action"].clone(), Reference(**state["reference"])
 
 
 _LEG = ((0, 1), (1, -1), (2, -1), (3, 1), (4, 1), (5, -1))

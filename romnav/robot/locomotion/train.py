@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,14 +18,17 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
+from romnav import files
 from romnav.errors import RomnavError
 from romnav.progress import Progress
 from romnav.robot.locomotion.task import LocomotionEnv, WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.spec import LocomotionSpec, PpoSpec
+from romnav.tensors import Kind
 from romnav.world.build import build
 
+KIND = Kind("romnav-locomotion-1", "locomotion policy", "train one with `romnav train locomotion`")
 GROUPS = {"actor": ["policy"], "critic": ["policy", "privileged"]}
 
 
@@ -132,12 +136,10 @@ def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor],
     """Spec, deterministic policy (observation -> action; averaged weights) and iteration of a checkpoint.
 
     Raises:
-        RomnavError: the file is missing.
+        RomnavError: the file is missing, damaged or no locomotion policy.
     """
-    if not path.exists():
-        raise RomnavError(f"{path}: no locomotion policy; train one with `romnav train locomotion`")
-    saved = torch.load(path, map_location="cpu", weights_only=False)
-    spec = LocomotionSpec.model_validate(saved["spec"], strict=False)
+    saved = KIND.load(path)
+    spec = LocomotionSpec.model_validate_json(saved["spec"])
     width = saved["ppo"]["actor_state_dict"]["obs_normalizer._mean"].shape[1]
     actions = saved["ppo"]["actor_state_dict"]["distribution.std_param"].shape[0]
     actor = make_actor(spec.ppo, TensorDict({"policy": torch.zeros(1, width)}, batch_size=[1]), actions)
@@ -153,8 +155,8 @@ def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor],
 
 def training_cost(path: Path) -> dict[str, Any]:
     """Iterations, policy steps and hours that a checkpoint cost."""
-    saved = torch.load(path, map_location="cpu", weights_only=False)
-    steps = LocomotionSpec.model_validate(saved["spec"], strict=False).steps(saved["iteration"])
+    saved = KIND.load(path)
+    steps = LocomotionSpec.model_validate_json(saved["spec"]).steps(saved["iteration"])
     return {"iterations": saved["iteration"], "steps": steps, "hours": round(saved["seconds"] / 3600, 3)}
 
 
@@ -169,12 +171,10 @@ def _save(
 ) -> None:
     state = {
         "average": average,
-        "spec": spec.model_dump(), "iteration": iteration, "seconds": seconds, "ppo": ppo.save(),
+        "spec": spec.model_dump_json(), "iteration": iteration, "seconds": seconds, "ppo": ppo.save(),
         "learning_rate": ppo.learning_rate, "torch_random": torch.get_rng_state(), "env": env.state_dict(),
     }  # fmt: skip
-    part = path.with_suffix(".tmp")
-    torch.save(state, part)
-    part.replace(path)
+    KIND.save(path, state)
 
 
 def train(
@@ -188,7 +188,7 @@ def train(
     save_every: float = 60.0,
     worlds: Path | None = None,
 ) -> Path:
-    """Train a policy; writes `out/policy.pt` and a row per iteration to `out/curve.csv`.
+    """Train a policy; writes `out/policy.pt`, and `out/curve.csv` with a row per iteration.
 
     Args:
         spec: what to train. When a run is resumed, `spec.iterations` may differ from the checkpoint's.
@@ -204,8 +204,9 @@ def train(
         The checkpoint.
 
     Raises:
-        RomnavError: the checkpoint there was trained by another specification, `device` is not supported, or a loss,
-            reward, observation or weight is not finite; the last checkpoint is then the last good one.
+        RomnavError: the checkpoint there was trained by another specification or for longer, `device` is not
+            supported, or a loss, reward, observation or weight is not finite; the last checkpoint is then the last
+            good one.
     """
     if device != "cpu":
         raise RomnavError(f"train locomotion: device {device!r} has no physics engine here; use --device cpu")
@@ -213,10 +214,16 @@ def train(
     path = out / "policy.pt"
     torch.manual_seed(spec.seed)
     lanes = LocomotionEnv(spec, curriculum(np.random.default_rng(spec.seed)), threads=threads)
-    saved = torch.load(path, weights_only=False) if resume and path.exists() else None
+    saved = KIND.load(path) if resume and path.exists() else None
     if saved and not _leads_to(saved, spec):
         raise RomnavError(f"{path}: trained by another specification; use another directory or --no-resume")
     done, spent = (saved["iteration"], saved["seconds"]) if saved else (0, 0.0)
+    if done > spec.iterations:
+        raise RomnavError(
+            f"{path}: has had {done} iterations, more than locomotion.iterations, {spec.iterations}; raise that, or "
+            "pass --no-resume to start over"
+        )
+    curve = _read_curve(out / "curve.csv", done)
 
     def joined() -> Together:
         world = build(spec.tiles.world, worlds)
@@ -264,18 +271,19 @@ def train(
             "std": ppo.actor.distribution.std_param.mean().item(), "learning_rate": ppo.learning_rate,
         } | losses  # fmt: skip
         _check_finite(path, iteration, row, ppo)
-        _append(out / "curve.csv", row, fresh=iteration == 1)
+        curve.append(row)
         if progress:
             progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
         if time.monotonic() - mark > save_every or iteration == spec.iterations:
             mark = time.monotonic()
+            _write_curve(out / "curve.csv", curve)  # first: a resumed run drops what is there too much
             _save(path, spec, ppo, average, env, iteration, row["seconds"])
     return path
 
 
 def _leads_to(saved: dict[str, Any], spec: LocomotionSpec) -> bool:
     """Whether a run of `spec` passes through a checkpoint: without robots on tiles as long as it has none."""
-    then = LocomotionSpec.model_validate(saved["spec"], strict=False)
+    then = LocomotionSpec.model_validate_json(saved["spec"])
     now = spec.model_copy(update={"iterations": then.iterations})
     if saved["iteration"] <= spec.tiles.begin and (then.tiles.robots == 0 or saved["iteration"] <= then.tiles.begin):
         now = now.model_copy(update={"tiles": then.tiles})
@@ -307,21 +315,24 @@ def _row(rows: list[dict[str, float]]) -> dict[str, float]:
     }
 
 
-def _append(path: Path, row: dict[str, float], *, fresh: bool) -> None:
-    """Add a row; columns that the file does not have yet are added, with zeros above."""
-    before: list[dict[str, Any]] = []
-    if not fresh and path.exists():
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            columns = list(reader.fieldnames or [])
-            before = list(reader) if set(row) - set(columns) else []
-    else:
-        columns = []
-    new = not columns or bool(before)
-    columns += [name for name in row if name not in columns]
-    with path.open("w" if new else "a", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval=0)
-        if new:
-            writer.writeheader()
-            writer.writerows(before)
-        writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
+def _read_curve(path: Path, iterations: int) -> list[dict[str, Any]]:
+    """Rows of a curve up to an iteration: those behind it are written again by the run that goes on from there."""
+    if not iterations or not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [row for row in csv.DictReader(file) if int(row["iteration"]) <= iterations]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RomnavError(f"{path}: damaged; restore it, or delete it to begin a new one") from error
+
+
+def _write_curve(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Columns that come up along the run have zeros above."""
+    text = io.StringIO()
+    columns = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, columns, restval=0, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(
+        {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in row.items()} for row in rows
+    )
+    files.write(path, text.getvalue())

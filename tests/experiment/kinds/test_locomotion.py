@@ -39,7 +39,7 @@ def test_the_humanoid_walks_on_the_locomotion_policy_of_its_scale(tmp_path: Path
     here.project.file("humanoid").write_text(ARMS)
     settings = episodes(here, "walked", 0).settings
     assert isinstance(settings, Scale)
-    with pytest.raises(RomnavError, match=r"gaits\.pt: no gait library; record one with `romnav train gaits`"):
+    with pytest.raises(RomnavError, match=r"gaits\.pt: no such gait library; record one with `romnav train gaits`"):
         body(here, settings, 0, "cpu", 1)
     execute(pending([locomotion(here)]), Session())
     GaitLibrary([]).save(gaits(here).folder / "gaits.pt")

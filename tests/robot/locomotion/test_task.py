@@ -14,7 +14,7 @@ from romnav.robot.locomotion.lip import turn_xy
 from romnav.robot.locomotion.task import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR, LocomotionEnv
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
-from romnav.robot.locomotion.train import load_policy, train
+from romnav.robot.locomotion.train import KIND, load_policy, train
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
@@ -110,7 +110,7 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
     whole = train(SPEC, tmp_path / "whole", threads=1)
     train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
     parts = train(SPEC, tmp_path / "parts", threads=2)
-    a, b = (torch.load(path, weights_only=False) for path in (whole, parts))
+    a, b = (KIND.load(path) for path in (whole, parts))
     assert a["iteration"] == b["iteration"] == 2
     for key, value in a["ppo"]["actor_state_dict"].items():
         assert torch.equal(value, b["ppo"]["actor_state_dict"][key]), key
@@ -122,8 +122,23 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
     assert policy(torch.zeros(3, len(MIRROR[0]))).shape == (3, 15)
     with pytest.raises(RomnavError, match="another specification"):
         train(SPEC.model_copy(update={"seed": 9}), tmp_path / "parts", threads=1)
-    with pytest.raises(RomnavError, match="no locomotion policy"):
+    with pytest.raises(RomnavError, match="has had 2 iterations, more than"):
+        train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
+    with pytest.raises(RomnavError, match="no such locomotion policy"):
         load_policy(tmp_path / "none.pt")
+
+
+def test_rows_behind_the_checkpoint_are_not_there_twice(tmp_path: Path) -> None:
+    train(SPEC.model_copy(update={"iterations": 1}), tmp_path, threads=1)
+    head, row = (tmp_path / "curve.csv").read_text().splitlines()
+    place = head.split(",").index("iteration")
+    later = ",".join("2" if i == place else cell for i, cell in enumerate(row.split(",")))
+    (tmp_path / "curve.csv").write_text("\n".join([head, row, later]) + "\n")
+    train(SPEC, tmp_path, threads=1)
+    lines = (tmp_path / "curve.csv").read_text().splitlines()
+    assert [line.split(",")[place] for line in lines] == ["iteration", "1", "2"]
+    assert lines[1] == row
+    assert lines[2] != later
 
 
 def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Path) -> None:
@@ -134,7 +149,7 @@ def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Pat
     train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
     train(spec.model_copy(update={"iterations": 2}), tmp_path / "parts", threads=1, worlds=tmp_path)
     parts = train(spec, tmp_path / "parts", threads=2, worlds=tmp_path)
-    a, b = (torch.load(path, weights_only=False) for path in (whole, parts))
+    a, b = (KIND.load(path) for path in (whole, parts))
     for key, value in a["ppo"]["actor_state_dict"].items():
         assert torch.equal(value, b["ppo"]["actor_state_dict"][key]), key
     for part in (lambda env: env, lambda env: env["tiles"]):
@@ -180,16 +195,13 @@ def test_training_stops_at_what_is_not_finite(tmp_path: Path) -> None:
 
 
 def test_the_policy_that_is_used_has_the_weights_averaged_over_iterations(tmp_path: Path) -> None:
-    first, second = (
-        torch.load(train(SPEC.model_copy(update={"iterations": n}), tmp_path, threads=1), weights_only=False)
-        for n in (1, 2)
-    )
+    first, second = (KIND.load(train(SPEC.model_copy(update={"iterations": n}), tmp_path, threads=1)) for n in (1, 2))
     actor, keep = second["ppo"]["actor_state_dict"], SPEC.ppo.average
     assert set(second["average"]) == {name for name in actor if not name.startswith("obs_normalizer")}
     for name, value in second["average"].items():
         torch.testing.assert_close(value, keep * first["average"][name] + (1 - keep) * actor[name])
     second["average"] = {name: torch.zeros_like(value) for name, value in second["average"].items()}
-    torch.save(second, tmp_path / "policy.pt")
+    KIND.save(tmp_path / "policy.pt", second)
     assert (load_policy(tmp_path / "policy.pt")[1](torch.rand(3, len(MIRROR[0]))) == 0).all()
 
 

@@ -1,0 +1,134 @@
+"""Runs stages as tasks of a Ray cluster, whose machines share the project's folder."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from romnav.errors import RomnavError
+from romnav.experiment.graph import records
+from romnav.experiment.graph.run import execute
+from romnav.experiment.graph.stage import Session, Stage
+from romnav.progress import lines
+
+RETRIES = 10
+"""Times that a stage whose machine has died goes on elsewhere."""
+
+
+class Queue(Protocol):
+    """Where tasks put (stage, line of progress)."""
+
+    def put(self, item: tuple[str, str] | None) -> None:
+        """Append."""
+        ...
+
+    def get(self) -> tuple[str, str] | None:
+        """Wait for the next; None is the last."""
+        ...
+
+
+def execute_on_ray(
+    address: str, needs: Mapping[str, float], stages: Iterable[Stage], session: Session, say: Callable[[str], None]
+) -> None:
+    """Runs stages as soon as those that they need are done, as many at a time as the cluster holds.
+
+    A stage whose worker dies goes on from its checkpoint on another one. When a stage fails, or at Ctrl-C, the others
+    are stopped; what they have done is kept.
+
+    Args:
+        address: ``ray`` joins the cluster that ``RAY_ADDRESS`` names, or starts one here; ``ray://host:port`` joins
+            that one.
+        needs: What a stage takes of a machine: ``num_cpus``, ``num_gpus`` and ``memory`` in bytes.
+        stages: Upstream ones first.
+        session: On which device, and whether interrupted ones are continued.
+        say: Is told which stages begin.
+
+    Raises:
+        RomnavError: Another engine; Ray is not installed or cannot be reached; a stage cannot do or write what it
+            should.
+    """
+    if address != "ray" and not address.startswith("ray://"):
+        raise RomnavError(f"--on {address}: no engine; give ray or ray://host:port")
+    try:
+        import ray
+        from ray.util.queue import Queue as RayQueue
+    except ImportError as error:
+        raise RomnavError("--on ray: Ray is not installed; run `pip install 'romnav[ray]'`") from error
+    stages = list(stages)
+    if not session.resume:
+        for stage in stages:
+            records.begin(stage, resume=False)
+        session = replace(session, resume=True)  # a stage that goes on elsewhere must not start over
+    try:
+        ray.init(address if address != "ray" else None, log_to_driver=False, logging_level="ERROR")
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise RomnavError(f"--on {address}: {str(error).splitlines()[0]}; is the cluster there?") from error
+    try:
+        queue = RayQueue(actor_options={"num_cpus": 0})
+        task = ray.remote(**needs, max_retries=RETRIES)(_run)
+        running: dict[str, Any] = {}
+        for stage in stages:
+            above = [running[other.name] for other in stage.upstream if other.name in running]
+            running[stage.name] = task.options(name=stage.name).remote(
+                stage, session, queue, Path.cwd(), sys.argv, *above
+            )
+            say(stage.name)
+        with lines(list(running)) as show:
+            shown = threading.Thread(target=_show, args=(queue, show), daemon=True)
+            shown.start()
+            try:
+                _wait(ray, list(running.values()))
+            except BaseException:
+                for reference in running.values():
+                    ray.cancel(reference, force=True)
+                raise
+            finally:
+                queue.put(None)
+                shown.join(5.0)
+    finally:
+        ray.shutdown()
+
+
+def _wait(ray: Any, references: list[Any]) -> None:
+    while references:
+        done, references = ray.wait(references)
+        try:
+            ray.get(done)
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause if isinstance(error.cause, RomnavError) else error from None
+        except ray.exceptions.RayError as error:
+            raise RomnavError(f"--on ray: {str(error).splitlines()[0]}; run it again to go on") from error
+
+
+def _show(queue: Queue, show: Callable[[str, str], None]) -> None:
+    with contextlib.suppress(Exception):  # the cluster may go first
+        while (item := queue.get()) is not None:
+            show(*item)
+
+
+def _run(stage: Stage, session: Session, queue: Queue, folder: Path, command: list[str], *above: None) -> None:
+    """In a worker: the stage, once those ``above`` are done."""
+    os.chdir(folder)
+    sys.argv = command
+    with contextlib.redirect_stderr(_Lines(stage.name, queue)):
+        execute([stage], session)
+
+
+class _Lines(io.TextIOBase):
+    """A stream whose lines go to a queue under the name of a stage."""
+
+    def __init__(self, name: str, queue: Queue) -> None:
+        self._name, self._queue, self._rest = name, queue, ""
+
+    def write(self, text: str) -> int:
+        *whole, self._rest = (self._rest + text).split("\n")
+        for line in filter(None, whole):
+            self._queue.put((self._name, line))
+        return len(text)
