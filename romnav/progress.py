@@ -6,6 +6,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Column
 
 Progress = Callable[[int, int, str], None]
 """What a long computation is given to report on itself: (units done, units in all, text of its metric)."""
@@ -58,13 +62,14 @@ def bar(title: str) -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
+    from rich.table import Column
 
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(24),
-        TextColumn("{task.fields[text]}", markup=False),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, min_width=len(title))),
+        BarColumn(12),
+        TextColumn("{task.fields[text]}", markup=False, table_column=_rest()),
     )
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    with Bars(*columns, console=Console(stderr=True), expand=True) as bars:
         task = bars.add_task(title, total=None, text="")
         yield lambda done, total, metric: bars.update(
             task, completed=done, total=total, text=meter.describe(done, total, metric)
@@ -90,6 +95,13 @@ def _tell(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
+def _rest() -> Column:
+    """A column of the terminal's remaining width, its text cut at the end rather than wrapped."""
+    from rich.table import Column
+
+    return Column(ratio=1, no_wrap=True, overflow="ellipsis")
+
+
 @contextmanager
 def lines(names: Sequence[str]) -> Iterator[Callable[[str, str], None]]:
     """Shows the latest line of each of several concurrent stages on standard error: (name, line)."""
@@ -100,7 +112,7 @@ def lines(names: Sequence[str]) -> Iterator[Callable[[str, str], None]]:
     from rich.progress import Progress as Bars
     from rich.progress import SpinnerColumn, TextColumn
 
-    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False)
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False, table_column=_rest())
+    with Bars(*columns, console=Console(stderr=True), expand=True) as bars:
         tasks = {name: bars.add_task(name, total=None) for name in names}
         yield lambda name, line: bars.update(tasks[name], description=line)

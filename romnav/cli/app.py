@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shlex
 import signal
 import sys
@@ -70,4 +71,7 @@ def _before_the_command(
 
 def main() -> None:
     """Entry point of ``romnav``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # where a terminal has no dash, it shows a question mark
     app()

@@ -18,7 +18,7 @@ from torch import Tensor
 from romnav.navigation.guidance import Guidance
 from romnav.navigation.observations import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
-from romnav.navigation.spec import PolicySpec, PPOSpec
+from romnav.navigation.spec import NETWORKS, PolicySpec, PPOSpec
 from romnav.precision import reduced_precision
 from romnav.sensing.encoder import Encoder
 
@@ -97,7 +97,7 @@ class Terms:
     def __init__(self, by_name: dict[str, Term]) -> None:
         self.by_name = by_name
         self.surrogate = 1.0
-        self._seen: dict[str, list[float]] = {}
+        self._seen: dict[str, list[Tensor]] = {}
 
     def __len__(self) -> int:
         return len(self.by_name)
@@ -110,12 +110,12 @@ class Terms:
         """Weighted sum of the terms."""
         losses = {name: term.loss(actor, batch) for name, term in self.by_name.items()}
         for name, loss in losses.items():
-            self._seen.setdefault(name, []).append(loss.item())
+            self._seen.setdefault(name, []).append(loss.detach())
         return torch.stack([self.by_name[name].coefficient * loss for name, loss in losses.items()]).sum()
 
     def means(self) -> dict[str, float]:
         """Means of the terms, unweighted, since they were last asked for."""
-        means = {name: sum(seen) / len(seen) for name, seen in self._seen.items()}
+        means = {name: float(torch.stack(seen).mean()) for name, seen in self._seen.items()}
         self._seen = {}
         return means
 
@@ -173,7 +173,8 @@ P = TypeVar("P", bound=BoundedPPO)
 
 def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> NavigationActor:
     """Policy network for the observations ``obs``; one that is ``guided`` also guesses the way."""
-    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
+    network: type[NavigationActor] = NETWORKS.load(policy.network) if policy.network else NavigationActor
+    return network(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
 def make_ppo(

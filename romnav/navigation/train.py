@@ -180,6 +180,7 @@ def _save(
         **ppo.memories(),
         "env": env.state_dict(),
         "random": torch.get_rng_state(),
+        **({"device_random": torch.cuda.get_rng_state(env.device)} if env.device != "cpu" else {}),
         "iterations": done,
         "seconds": seconds,
         "curve": curve,
@@ -208,6 +209,8 @@ def _restore(
     ppo.remember(content)
     env.load_state_dict(content["env"])
     torch.set_rng_state(content["random"].cpu())
+    if "device_random" in content:
+        torch.cuda.set_rng_state(content["device_random"].cpu(), env.device)
 
 
 def _row(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.statistics import Estimate
 from romnav.report import paper
-from romnav.report.formats import Block, Cell, Row, Table, number
+from romnav.report.formats import Block, Cell, Row, Table, literal, number
 
 SHARE = 0.1
 """Part of the run over which success is averaged: a trailing window in the figure, the last one in the table."""
@@ -129,7 +130,7 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
         shown = np.isfinite(rates).all(axis=0)
         iteration, rates = iteration[shown], rates[:, shown]
         axes.fill_between(iteration, rates.min(axis=0), rates.max(axis=0), color=colour, alpha=0.2, linewidth=0)
-        axes.plot(iteration, rates.mean(axis=0), color=colour, label=curves.label)
+        axes.plot(iteration, rates.mean(axis=0), color=colour, label=literal(curves.label))
         if 0.0 < curves.unfreeze_at < 1.0:
             axes.axvline(round(curves.unfreeze_at * curves.iterations), color=colour, linestyle=":", linewidth=1)
     axes.set(xlabel="iteration", ylabel="success while training (%)", ylim=(0, None), xlim=(0, None))
@@ -139,10 +140,17 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def tabulate(name: str, title: str, arms: Mapping[str, Curves], provenance: dict[str, str]) -> Table:
-    """Final success and iteration time of every arm; times are relative to the first arm's frozen iterations."""
+def tabulate(
+    name: str,
+    title: str,
+    arms: Mapping[str, Curves],
+    provenance: dict[str, str],
+    sources: Mapping[str, tuple[Mapping[str, Any], ...]],
+) -> Table:
+    """Final success and iteration time of every arm, with what their runs come from; times are relative to the first
+    arm's frozen iterations."""
     reference = next(iter(arms.values())).iteration_time(unfrozen=False)
-    ours = tuple(Row(curves.label, _cells(curves, reference)) for curves in arms.values())
+    ours = tuple(Row(curves.label, _cells(curves, reference), sources[arm]) for arm, curves in arms.items())
     dash = number(math.nan, 1)
     factors = {arms[arm].label: factor for arm, factor in paper.ITERATION_TIME.items() if arm in arms}
     published = tuple(Row(label, (dash, dash, number(factor, 2))) for label, factor in factors.items())

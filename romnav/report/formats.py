@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from romnav import files
 
@@ -31,12 +32,18 @@ def number(value: float, decimals: int, *, sign: bool = False, dagger: bool = Fa
     return Cell(value, text, facts, dagger=dagger)
 
 
+def literal(text: str) -> str:
+    """Text that matplotlib shows as it is: a dollar is no formula."""
+    return text.replace("$", r"\$")
+
+
 @dataclass(frozen=True)
 class Row:
-    """A labelled row of numbers."""
+    """A labelled row of numbers, and the files that they are made of with their provenance, for the report."""
 
     label: str
     cells: tuple[Cell, ...]
+    sources: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 from romnav.evaluation.rowfile import Provenance
 
@@ -25,3 +27,8 @@ def training(files: Sequence[Provenance]) -> str:
 def distinct(texts: Iterable[str]) -> str:
     """The texts that there are, each once."""
     return ", ".join(sorted(set(texts)))
+
+
+def source(file: str | Path, provenance: Provenance) -> dict[str, Any]:
+    """A file of rows, by its place under ``results/``, and where it comes from."""
+    return {"file": "/".join(Path(file).parts[-4:]), **provenance.model_dump()}

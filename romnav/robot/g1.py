@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav.robot.spec import RobotSpec
+from romnav.threads import cores
 
 SIDES = ("left", "right")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -267,7 +268,7 @@ class Humanoids(Robots):
     def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
         super().__init__(spec, ground, count)
         self._models: list[mujoco.MjModel] = []
-        self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
+        self.batch = mujoco.batch.Batch(self.model, count, threads or cores(), persistent=True)
         for field in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             self.batch.bind(field)
         for field in ("xpos", "xmat", "subtree_com", "xanchor", "xaxis", "sensordata", "actuator_force"):

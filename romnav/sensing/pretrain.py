@@ -312,7 +312,7 @@ def quality(
         and all of it in ``dropout_50``.
     """
     poses = Poses([grids for _, grids in tiles], height, seed, device)
-    kinds = np.array([tile.kind.value for tile, _ in tiles])
+    kinds = np.array([tile.kind for tile, _ in tiles])
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
         corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)

@@ -101,6 +101,10 @@ def look(
     direction[e] = wp.normalize(wp.vec2(end[0], end[1]) - p)
 
 
+STRIDE = 0.1
+"""Spacing of the points of a route, m."""
+
+
 class GeodesicLookup:
     """Distance and direction to the goals of a world at any position, not at nodes alone.
 
@@ -149,6 +153,33 @@ class GeodesicLookup:
         # on along the path and back to it at once: back alone would lead in circles around a corner
         on = torch.nn.functional.normalize(direction + back / self._world.cell, dim=1)
         return distance + torch.linalg.vector_norm(back, dim=1), torch.where(off, on, direction)
+
+    def routes(self, tile: Tensor, layer: Tensor, xy: Tensor, goal: Tensor) -> list[NDArray[np.float32]]:
+        """Shortest paths (K, 3) of robots placed as in a call to their goals, points about `STRIDE` apart, m."""
+        world = self._world
+        height = world.surface(tile, layer, xy)
+        walking = torch.ones(len(xy), dtype=torch.bool, device=xy.device)
+        count, points = torch.zeros(len(xy), dtype=torch.int64, device=xy.device), []
+        longest = float(self(tile, layer, xy, goal)[0].max())
+        for _ in range(round(2.0 * longest / STRIDE) + 1):
+            points.append(torch.cat([xy, height[:, None]], dim=1))
+            distance, direction = self(tile, layer, xy, goal)
+            count += walking
+            walking &= distance >= STRIDE
+            if not walking.any():
+                break
+            step = STRIDE * direction * walking[:, None]
+            for axis in (0, 1):  # slide along what is in the way: paths are those of the middles of cells
+                along = step * torch.eye(2, device=xy.device)[axis]
+                free = torch.stack([world.node_at(tile, layer, xy + s) >= 0 for s in (step, along)])
+                step = torch.where((~free[0] & free[1])[:, None], along, step)
+            xy = xy + step
+            node = world.node_at(tile, layer, xy)
+            layer = torch.where(node >= 0, world.layer[node], layer)
+            surface = world.surface(tile, layer, xy)
+            height = torch.where(surface.isnan(), height, surface)
+        whole = torch.stack(points, dim=1).cpu().numpy()
+        return [path[:n] for path, n in zip(whole, count.tolist(), strict=True)]
 
     def _look(self, node: Tensor, xy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """The same at positions (E, 2) in the cells of nodes (E,)."""

@@ -71,7 +71,7 @@ def test_iteration_times_are_of_the_phases_and_shrug_off_outliers(arms: dict[str
 
 
 def test_the_table_has_our_rows_and_the_papers(arms: dict[str, curves.Curves]) -> None:
-    table = curves.tabulate("pretrain", "Encoder", arms, {"scale": "smoke", "commit": "abc"})
+    table = curves.tabulate("pretrain", "Encoder", arms, {"scale": "smoke", "commit": "abc"}, dict.fromkeys(arms, ()))
     ours, published = table.blocks
     assert [row.label for row in ours.rows] == ["Frozen", "Unfrozen @ half", "No Pretraining"]
     assert [row.cells[2].text for row in ours.rows] == ["1.00", "1.50", "1.50"]

@@ -14,6 +14,7 @@ from romnav.errors import RomnavError
 from romnav.experiment.graph.run import execute, waves
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import lines
+from romnav.threads import cores
 
 
 def execute_side_by_side(stages: Iterable[Stage], session: Session, say: Callable[[str], None]) -> None:
@@ -27,7 +28,7 @@ def execute_side_by_side(stages: Iterable[Stage], session: Session, say: Callabl
     for wave in waves(stages):
         commands = {stage.name: [*stage.command, *over] for stage in wave if stage.command}
         if commands:
-            side_by_side(commands, os.cpu_count() or 1)
+            side_by_side(commands, cores())
         execute([stage for stage in wave if not stage.command], session, say)
 
 

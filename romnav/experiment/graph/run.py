@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Collection, Iterable
 from functools import partial
@@ -62,7 +63,7 @@ def require(stage: Stage, reader: Stage) -> None:
         reason = "is unfinished, or something that it was made from has changed since"
     else:
         reason = "is missing"
-    command = " ".join(("romnav", *stage.command))
+    command = shlex.join(("romnav", *stage.command))
     raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
 
 
@@ -90,6 +91,17 @@ def waves(stages: Iterable[Stage]) -> list[list[Stage]]:
         groups += [[] for _ in range(level + 1 - len(groups))]
         groups[level].append(stage)
     return groups
+
+
+def prepare(stages: Iterable[Stage]) -> None:
+    """Makes sure that what stages will write can be written, which is better known before the first one than after it.
+
+    Raises:
+        RomnavError: A file cannot be written.
+    """
+    for stage in stages:
+        for path in (*(stage.folder / name for name in stage.outputs), stage.record):
+            files.prepare(path)
 
 
 def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None] = lambda line: None) -> None:

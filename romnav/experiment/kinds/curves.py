@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from romnav.errors import NothingRecorded
 from romnav.experiment.graph import records
@@ -14,6 +14,10 @@ from romnav.experiment.kinds.policy import policy
 from romnav.experiment.spec import Experiment
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
+
+if TYPE_CHECKING:
+    from romnav.report.curves import Curves
+    from romnav.report.formats import Table
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
@@ -31,9 +35,7 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             settings=experiment,
             uses=("title", "labels"),
             make=partial(_draw, work, experiment),
-            upstream=tuple(
-                policy(work, name, seed) for name, arm in experiment.arms.items() if not arm.policy for seed in seeds
-            ),
+            upstream=policies(work, name, seeds),
         )
     ]
 
@@ -44,19 +46,52 @@ def _draw(
     """Of the arms and training seeds that are there."""
     from romnav.report import curves, formats
 
-    name = Path(stage.outputs[0]).stem
-    arms, commits = {}, set()
-    recorded = {run.name: records.read(run) for run in stage.upstream}
-    finished = [run for run in stage.upstream if (record := recorded[run.name]) and record.outputs]
-    for arm, label in experiment.labels.items():
-        runs = [run for run in finished if run.arm == arm]
-        if runs:
-            unfreeze_at = work.arm_settings(arm).navigation.encoder.unfreeze_at
-            arms[arm] = curves.read(label, unfreeze_at, [run.folder / "curve.csv" for run in runs])
-        commits |= {record.provenance["commit"][:12] for run in runs if (record := recorded[run.name])}
-    if not arms:
+    name, runs = Path(stage.outputs[0]).stem, finished(stage.upstream)
+    if not runs:
         raise NothingRecorded(f"{stage.folder}: no arm of {name} is trained; run `romnav run ablation {name}`")
-    provenance = {"scale": work.scale, "commit": ", ".join(sorted(commits))}
+    arms = read(work, experiment, runs)
     curves.draw(arms, stage.folder / stage.outputs[0])
-    formats.write(curves.tabulate(name, experiment.title, arms, provenance), stage.folder / "tables")
+    formats.write(tabulate(work, name, arms, runs), stage.folder / "tables")
     return {}
+
+
+def policies(work: Workspace, name: str, seeds: Sequence[int]) -> tuple[Stage, ...]:
+    """The training runs of an experiment."""
+    arms = work.project.experiment(name).arms.items()
+    return tuple(policy(work, arm, seed) for arm, spec in arms if spec.trained for seed in seeds)
+
+
+def finished(runs: Sequence[Stage]) -> list[Stage]:
+    """Those training runs that came to their end."""
+    return [run for run in runs if (record := records.read(run)) and record.outputs]
+
+
+def read(work: Workspace, experiment: Experiment, runs: Sequence[Stage]) -> dict[str, Curves]:
+    """The learning curves of training runs, by arm.
+
+    Raises:
+        RomnavError: A curve is unreadable, or those of an arm differ in length.
+    """
+    from romnav.report import curves
+
+    arms = {}
+    for arm, label in experiment.labels.items():
+        if files := [run.folder / "curve.csv" for run in runs if run.arm == arm]:
+            arms[arm] = curves.read(label, work.arm_settings(arm).navigation.encoder.unfreeze_at, files)
+    return arms
+
+
+def tabulate(work: Workspace, name: str, arms: Mapping[str, Curves], runs: Sequence[Stage]) -> Table:
+    """The table of the arms of finished training runs."""
+    from romnav.report import curves
+
+    made = [record.provenance["commit"][:12] for run in runs if (record := records.read(run))]
+    provenance = {"scale": work.scale, "commit": ", ".join(sorted(set(made)))}
+    sources = {arm: tuple(_source(run) for run in runs if run.arm == arm) for arm in arms}
+    return curves.tabulate(name, work.project.experiment(name).title, arms, provenance, sources)
+
+
+def _source(run: Stage) -> dict[str, Any]:
+    record = records.read(run)
+    file = "/".join((run.folder / "curve.csv").parts[-4:])
+    return {"file": file, "spec_hash": run.key[:16], **(record.facts | record.provenance if record else {})}

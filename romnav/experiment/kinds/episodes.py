@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,9 @@ from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
+    from romnav.evaluation.episodes import EpisodeSet
     from romnav.report.paired.gallery import EpisodeGallery
+    from romnav.world.world import World
 
 
 def episodes(work: Workspace, arm: str, seed: int) -> Stage:
@@ -31,6 +33,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(_set(work),),
+        code=driven.code,
         upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
@@ -79,18 +82,26 @@ def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
     Raises:
         RomnavError: They are missing or out of date.
     """
-    from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import rows
     from romnav.evaluation.tracks import read
     from romnav.report.paired.gallery import EpisodeGallery
 
-    stage = episodes(work, arm, seed)
-    run, path = rows.read(stage.folder / "episodes.parquet"), _set(work)
-    paired = load(path)
+    stage, path = episodes(work, arm, seed), _set(work)
+    run = rows.read(stage.folder / "episodes.parquet")
+    tracks, _ = read(stage.folder / "tracks.npz")
+    paired, world = ground(path, work.project.worlds)
     if run.provenance.episode_set != paired.digest:
         raise RomnavError(
             f"{run.source}: rows of episode set {run.provenance.episode_set}, but {path} is {paired.digest}; "
             f"run `romnav {shlex.join(stage.command)}`"
         )
-    tracks, _ = read(stage.folder / "tracks.npz")
-    return EpisodeGallery(run, tracks, paired, terrain(paired, path, work.project.worlds))
+    return EpisodeGallery(run, tracks, paired, world)
+
+
+@cache
+def ground(path: Path, worlds: Path) -> tuple[EpisodeSet, World]:
+    """The episodes of a file and their terrain, read once however many arms are looked at."""
+    from romnav.evaluation.episodes import load, terrain
+
+    paired = load(path)
+    return paired, terrain(paired, path, worlds)

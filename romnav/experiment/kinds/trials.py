@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import romnav.world.scenes
 from romnav.errors import NothingRecorded, RomnavError
@@ -18,6 +18,8 @@ from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
+    from romnav.evaluation.trials.rows import TrialRows
+    from romnav.report.formats import Table
     from romnav.world.scenes.scene import Scene
 
 SCENES = tuple(sorted(Path(romnav.world.scenes.__path__[0]).glob("[!_]*.py")))
@@ -38,6 +40,11 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
             f"reduced-order model with a body; name {driver} in its place"
         )
     driven = Driven.by(work, arm, seed)
+    if driven.settings.navigation.dynamics not in ("rom", "g1"):
+        raise RomnavError(
+            f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.navigation.dynamics: trials need a body "
+            "that touches the solids themselves; set rom or g1"
+        )
     return Stage(
         kind="trials",
         name=f"{kind} {arm}, seed {driven.seed}",
@@ -48,6 +55,7 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
         uses=(kind, *driven.uses),
         make=partial(_run, driven, kind),
         reads=SCENES,
+        code=driven.code,
         upstream=driven.upstream,
         arm=arm,
         seed=driven.seed,
@@ -106,22 +114,34 @@ def _report(
     name: str, experiment: Experiment, kind: TrialKind, stage: Stage, session: Session, progress: Progress
 ) -> dict[str, Any]:
     """Of the arms that have been driven."""
-    from romnav.evaluation.trials import rows
     from romnav.report import formats
-    from romnav.report.trials import pictures, tables
+    from romnav.report.trials import pictures
 
-    files = [above.folder / above.outputs[0] for above in stage.upstream]
-    runs = [rows.read(file) for file in files if file.exists()]
+    runs = recorded(stage)
     if not runs:
-        raise NothingRecorded(f"{files[0]}: no trials yet; run `romnav run {' '.join({kind: 0, name: 0})}`")
-    scenes = _scenes(kind)
-    tabulate, draw = {
-        "safety": (tables.safety, pictures.draw_safety),
-        "deploy": (tables.deploy, pictures.draw_deployments),
-    }[kind]
-    formats.write(replace(tabulate(runs, scenes, experiment.labels), name=name), stage.folder / "tables")
-    draw(runs[0], scenes, stage.folder / stage.outputs[-1])
+        missing = stage.upstream[0].folder / stage.upstream[0].outputs[0]
+        raise NothingRecorded(f"{missing}: no trials yet; run `romnav run {' '.join({kind: 0, name: 0})}`")
+    draw = {"safety": pictures.draw_safety, "deploy": pictures.draw_deployments}[kind]
+    formats.write(tabulate(name, experiment, runs), stage.folder / "tables")
+    draw(runs[0], _scenes(kind), stage.folder / stage.outputs[-1])
     return {}
+
+
+def recorded(report: Stage) -> list[TrialRows]:
+    """The trials of a report's arms, as far as they have been driven."""
+    from romnav.evaluation.trials import rows
+
+    files = [above.folder / above.outputs[0] for above in report.upstream]
+    return [rows.read(file) for file in files if file.exists()]
+
+
+def tabulate(name: str, experiment: Experiment, runs: Sequence[TrialRows]) -> Table:
+    """The table of an experiment that consists of trials."""
+    from romnav.report.trials import tables
+
+    kind = cast(TrialKind, experiment.kind)
+    build = {"safety": tables.safety, "deploy": tables.deploy}[kind]
+    return replace(build(runs, _scenes(kind), experiment.labels), name=name)
 
 
 def _scenes(kind: TrialKind) -> tuple[Scene, ...]:

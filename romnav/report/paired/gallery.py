@@ -22,14 +22,14 @@ class EpisodeGallery:
     """Rows and tracks of an arm on the terrain they are of."""
 
     def __init__(self, run: EpisodeRows, tracks: Tracks, episodes: EpisodeSet, world: World) -> None:
-        self._run, self._tracks, self._episodes, self._world = run, tracks, episodes, world
+        self.run, self.tracks, self.episodes, self.world = run, tracks, episodes, world
 
     @cached_property
     def table(self) -> pd.DataFrame:
         """The rows with ``climb``, m, and the classes ``where`` and ``how`` of the failures."""
-        table = pd.DataFrame(dict(self._run.columns))
-        tile = self._episodes.columns["tile"]
-        where, how = classify(self._tracks, self._run.columns, tile, self._world, EnvSpec().period)
+        table = pd.DataFrame(dict(self.run.columns))
+        tile = self.episodes.columns["tile"]
+        where, how = classify(self.tracks, self.run.columns, tile, self.world, EnvSpec().period)
         return table.assign(climb=(table.goal_z - table.spawn_z).abs(), where=where, how=how)
 
     def choose(self, failed: bool, where: str | None) -> Sequence[int]:
@@ -59,4 +59,4 @@ class EpisodeGallery:
             row = self.table.loc[episode]
             end = f"{row['where']}, {row['how']}" if row["how"] else f"{row.success_time:.0f} s"
             titles[episode] = f"{episode}: {row.geodesic:.0f} m, climb {row.climb:.1f} m; {end}"
-        draw_maps(self._world, self._episodes, self._tracks, titles, self._run.arm, path)
+        draw_maps(self.world, self.episodes, self.tracks, titles, self.run.arm, path)

@@ -18,8 +18,6 @@ from romnav.world.lookup import GeodesicLookup
 from romnav.world.world import World
 
 TRACK, SHORTEST = "#1f6fb4", "#7b3294"
-STEP = 0.1
-"""Spacing of the points of a shortest way, m."""
 SIZE = 3.6
 """Side of a map, inches."""
 
@@ -31,15 +29,14 @@ def draw_maps(
 
     A row has the layers that the robot, its start or its goal were on.
     """
-    lookup = GeodesicLookup(world)
     rows = [_layers(world, episodes, tracks, episode) for episode in titles]
     columns = max(map(len, rows))
     figure = Figure(figsize=(SIZE * columns, SIZE * len(rows) + 0.6), layout="constrained")
     grid = figure.subplots(len(rows), columns, squeeze=False)
-    for axes_of, (episode, title), layers in zip(grid, titles.items(), rows, strict=True):
-        shortest = _shortest(world, lookup, episodes, episode)
+    routes = shortest(world, episodes, list(titles))
+    for axes_of, (episode, title), layers, route in zip(grid, titles.items(), rows, routes, strict=True):
         for axes, layer in zip(axes_of, layers, strict=False):
-            _draw(axes, world, episodes, tracks, shortest, episode, layer)
+            _draw(axes, world, episodes, tracks, route, episode, layer)
         for axes in axes_of[len(layers) :]:
             axes.set_axis_off()
         axes_of[0].set_ylabel(title, fontsize=8)
@@ -60,21 +57,10 @@ def _nearest(layers: Sequence[float], height: NDArray) -> NDArray[np.intp]:
     return np.abs(np.asarray(height)[:, None] - np.asarray(layers)).argmin(axis=1)
 
 
-def _shortest(world: World, lookup: GeodesicLookup, episodes: EpisodeSet, episode: int) -> NDArray:
-    """(N, 3) points of the shortest way of an episode, m."""
-    start = episodes.start("cpu")
-    tile, layer, xy, goal = (getattr(start, name)[episode : episode + 1] for name in ("tile", "layer", "xy", "goal"))
-    points = []
-    for _ in range(round(1.2 * float(episodes.columns["geodesic"][episode]) / STEP) + 1):
-        points.append([*xy[0].tolist(), float(world.surface(tile, layer, xy))])
-        distance, direction = lookup(tile, layer, xy, goal)
-        if distance < STEP:
-            break
-        ahead = xy + STEP * direction
-        node = world.node_at(tile, layer, ahead)
-        layer = torch.where(node >= 0, world.layer[node], layer)
-        xy = ahead
-    return np.array(points)
+def shortest(world: World, episodes: EpisodeSet, chosen: Sequence[int]) -> list[NDArray[np.float32]]:
+    """Points (K, 3) of the shortest path of each chosen episode, m."""
+    start, rows = episodes.start("cpu"), torch.tensor(chosen)
+    return GeodesicLookup(world).routes(start.tile[rows], start.layer[rows], start.xy[rows], start.goal[rows])
 
 
 def _draw(
@@ -82,7 +68,7 @@ def _draw(
     world: World,
     episodes: EpisodeSet,
     tracks: Tracks,
-    shortest: NDArray,
+    route: NDArray,
     episode: int,
     layer: int,
 ) -> None:
@@ -90,7 +76,7 @@ def _draw(
     index = c["tile"][episode]
     tile = world.tiles[index]
     draw_grid(axes, tile, world.grids[index], layer)
-    for line, colour, style in ((shortest, SHORTEST, "--"), (tracks.position[tracks.of(episode)], TRACK, "-")):
+    for line, colour, style in ((route, SHORTEST, "--"), (tracks.position[tracks.of(episode)], TRACK, "-")):
         off = _nearest(tile.layers, line[:, 2]) != layer
         shown = np.where(off[:, None], np.nan, line[:, :2])
         axes.plot(*shown.T, color=colour, linestyle=style, linewidth=1.3)

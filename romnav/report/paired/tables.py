@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from romnav.errors import NothingRecorded, RomnavError
 from romnav.evaluation.paired.metrics import Level
@@ -13,7 +14,7 @@ from romnav.evaluation.paired.rows import HORIZONS, Arm
 from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
-from romnav.report.provenance import distinct, sources, training
+from romnav.report.provenance import distinct, source, sources, training
 
 
 @dataclass(frozen=True)
@@ -235,11 +236,15 @@ def _performance(spec: PerformanceSpec, bootstrap: Bootstrap) -> tuple[_Blocks, 
     bounds = tuple(entry for entry in spec.bounds if entry.arm in bootstrap.arms)
     known = {key for entry in spec.entries for key in paper.PERFORMANCE.get(entry.arm, ())}
     blocks = spec.blocks if known & {column.key for column in spec.columns} else ()
-    return _with_best(spec, (*spec.blocks, bounds), measured), _with_best(spec, blocks, published)
+    ours = _with_best(spec, (*spec.blocks, bounds), measured, bootstrap)
+    return ours, _with_best(spec, blocks, published)
 
 
 def _with_best(
-    spec: PerformanceSpec, blocks: Sequence[tuple[Entry, ...]], cell: Callable[[str, Column], Cell]
+    spec: PerformanceSpec,
+    blocks: Sequence[tuple[Entry, ...]],
+    cell: Callable[[str, Column], Cell],
+    measured: Bootstrap | None = None,
 ) -> _Blocks:
     """Rows of every block; bold marks a column's best shown value (and ties) among competing arms."""
     competing = [entry.arm for block in blocks for entry in block if entry.competes]
@@ -251,7 +256,16 @@ def _with_best(
         return {arm: dataclasses.replace(c, bold=shown.get(arm, math.nan) == best) for arm, c in cells.items()}
 
     columns = [column_cells(column) for column in spec.columns]
-    return [tuple(Row(e.label, tuple(cells[e.arm] for cells in columns)) for e in block) for block in blocks]
+    return [
+        tuple(Row(e.label, tuple(cells[e.arm] for cells in columns), _sources(measured, e.arm)) for e in block)
+        for block in blocks
+    ]
+
+
+def _sources(measured: Bootstrap | None, *arms: str) -> tuple[Mapping[str, Any], ...]:
+    """The rows of those arms that were evaluated."""
+    runs = [run for arm in arms if measured and arm in measured.arms for run in measured.arms[arm].runs]
+    return tuple(source(run.source, run.provenance) for run in runs)
 
 
 def _levels(spec: LevelsSpec, bootstrap: Bootstrap) -> tuple[_Blocks, _Blocks]:
@@ -266,17 +280,21 @@ def _levels(spec: LevelsSpec, bootstrap: Bootstrap) -> tuple[_Blocks, _Blocks]:
         diff, significant = paper.CONTRASTS.get((spec.reference.arm, arm), {}).get((horizon, level), (math.nan, False))
         return number(diff, 1, sign=True, dagger=significant)
 
-    def rows(entries: Iterable[Entry], cell: Callable[[str, int, Level], Cell]) -> tuple[Row, ...]:
+    def rows(
+        entries: Iterable[Entry], cell: Callable[[str, int, Level], Cell], measured: Bootstrap | None = None
+    ) -> tuple[Row, ...]:
         return tuple(
             Row(
                 f"{spec.reference.label} − {entry.label}",
                 tuple(cell(entry.arm, *where) for where in _BY_LEVEL),
+                _sources(measured, spec.reference.arm, entry.arm),
             )
             for entry in entries
         )
 
     bounds = [entry for entry in spec.bounds if entry.arm in bootstrap.arms]
-    return [rows(spec.others, measured), rows(bounds, measured)], [rows(spec.others, published)]
+    ours = [rows(entries, measured, bootstrap) for entries in (spec.others, bounds)]
+    return ours, [rows(spec.others, published)]
 
 
 def _provenance(spec: PerformanceSpec | LevelsSpec, bootstrap: Bootstrap) -> tuple[dict[str, str], str]:

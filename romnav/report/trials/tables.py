@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from romnav.evaluation.trials.rows import TrialRows
 from romnav.evaluation.trials.statistics import (
@@ -17,7 +18,7 @@ from romnav.evaluation.trials.statistics import (
 )
 from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
-from romnav.report.provenance import sources, training
+from romnav.report.provenance import source, sources, training
 from romnav.world.scenes.scene import Scene
 
 SHARED = 10
@@ -34,8 +35,9 @@ def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
         for scene in scenes:
             for filtered, arm in ARMS.items():
                 few, all_ = summarise(run, scene.name, filtered, SHARED), summarise(run, scene.name, filtered)
-                rows.append(Row(f"{scene.label}, {arm}", (*_counts(few), *_rates(all_))))
-            rows.append(Row(f"{scene.label}, CBF − no CBF", (*_dashes(3), *_differences(run, scene.name), *_dashes(1))))
+                rows.append(Row(f"{scene.label}, {arm}", (*_counts(few), *_rates(all_)), _rows(run, "safety")))
+            differences = (*_dashes(3), *_differences(run, scene.name), *_dashes(1))
+            rows.append(Row(f"{scene.label}, CBF − no CBF", differences, _rows(run, "safety")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
     published = []
     for scene in scenes:
@@ -88,7 +90,7 @@ def deploy(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
                     _share(s.falls, s.n),
                     _share(s.blocked, s.n) if filtered else number(math.nan, 1),
                 )
-                rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last)))
+                rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last), _rows(run, "deploy")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
     published = [
         Row(scene.label, (_of(1, 1), _of(0, 1), number(math.nan, 1), number(length, 0), *_dashes(3)))
@@ -121,6 +123,10 @@ def deploy(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
         blocks=tuple(blocks),
         provenance=provenance,
     )
+
+
+def _rows(run: TrialRows, kind: str) -> tuple[Mapping[str, Any], ...]:
+    return (source(f"{run.provenance.scale}/{run.arm}/seed-{run.seed}/{kind}.parquet", run.provenance),)
 
 
 def _counts(s: Summary) -> tuple[Cell, ...]:

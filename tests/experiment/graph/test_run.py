@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
-from romnav.experiment.graph.run import execute, pending, require, waves, with_all_above
+from romnav.experiment.graph.run import execute, pending, prepare, require, waves, with_all_above
 from romnav.experiment.graph.stage import Session, Stage
 
 KEYS = "abcdef"
@@ -397,3 +397,18 @@ def test_a_report_is_drawn_again_when_what_it_shows_has_changed_and_not_before(c
     assert not records.drawn(chain[2])
     (chain[2].folder / "out.txt").unlink()
     assert not records.drawn(report)
+
+
+@pytest.mark.parametrize("way", ["a file for the folder", "a folder for a file", "a folder that cannot be written"])
+def test_what_cannot_be_written_is_known_before_the_first_stage_runs(tmp_path: Path, way: str) -> None:
+    first = stage(tmp_path, "a", Settings())
+    last = stage(tmp_path, "b", Settings(), (first,))
+    if way == "a file for the folder":
+        last.folder.write_text("in the way")
+    elif way == "a folder for a file":
+        (last.folder / "out.txt").mkdir(parents=True)
+    else:
+        last = replace(last, folder=Path("/proc/romnav"), record=Path("/proc/romnav/record.json"))
+    with pytest.raises(RomnavError, match="cannot be written"):
+        prepare([first, last])
+    assert not (first.folder / "out.txt").exists()

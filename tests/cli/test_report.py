@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.cli.conftest import fails, romnav
+
+
+def test_tables_of_what_is_there_and_notes_of_what_is_not(evaluated: Path) -> None:
+    result = romnav("report")
+    assert result.exit_code == 0, result.output
+    page = evaluated / "results" / "smoke" / "report.html"
+    assert result.stdout.strip() == str(page)
+    text = page.read_text("utf-8")
+    assert "spawngoal-perf-rom" in text
+    assert "Uniform" in text
+    assert "no episodes of rom: " in result.stderr
+    assert "tracks.npz: no such tracks" in result.stderr
+    assert str(evaluated) not in text
+
+
+def test_mistakes_are_one_line(project: Path, evaluated: Path) -> None:
+    assert "nothing is recorded; run `romnav run ablation" in fails("report", "--scale", "paper")
+    assert "no such file of rows" in fails("report", "single-stage")
