@@ -81,6 +81,8 @@ def tables(
         else:
             drawn.append(stage)
             _print_tables(stage)
+    for fault in job.project.faults.values() if name is None else ():
+        raise fault
     if missing and not drawn:
         raise missing[0]
 

@@ -40,16 +40,27 @@ class Project:
         return self.root / ".cache" / "worlds"
 
     @cached_property
-    def experiments(self) -> dict[str, Experiment]:
-        """Experiments by name."""
+    def _read(self) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
         return load_experiments(self.root / "experiments")
+
+    @property
+    def experiments(self) -> dict[str, Experiment]:
+        """Valid experiments by name."""
+        return self._read[0]
+
+    @property
+    def faults(self) -> dict[str, RomnavError]:
+        """What is wrong with the others, by name."""
+        return self._read[1]
 
     def experiment(self, name: str) -> Experiment:
         """One experiment.
 
         Raises:
-            RomnavError: There is none of this name.
+            RomnavError: There is none of this name, or it is invalid.
         """
+        if name in self.faults:
+            raise self.faults[name]
         if name not in self.experiments:
             raise RomnavError(f"unknown experiment {name}{suggest(name, self.experiments)}")
         return self.experiments[name]
@@ -67,11 +78,15 @@ class Project:
         """An experiment that has a trained arm.
 
         Raises:
-            RomnavError: None has it.
+            RomnavError: None has it; if one is invalid, it may.
         """
         for name, experiment in self.experiments.items():
             if arm in experiment.arms:
                 return name, experiment
+        if arm in SCRIPTED:
+            raise RomnavError(f"arm {arm} is a script: there is nothing to train; drive it by `romnav eval {arm}`")
+        for fault in self.faults.values():
+            raise fault
         raise RomnavError(f"unknown arm {arm}{suggest(arm, self.arms)}")
 
     def driver(self, arm: str) -> str:
@@ -108,5 +123,6 @@ class Project:
     def _evaluated(self, arm: str) -> str:
         found: dict[str, list[int]] = {}
         for file in sorted(self.results.glob(f"*/{arm}/seed-*/episodes.parquet")):
-            found.setdefault(file.parts[-4], []).append(int(file.parts[-2].removeprefix("seed-")))
+            if (seed := file.parts[-2].removeprefix("seed-")).isdecimal():
+                found.setdefault(file.parts[-4], []).append(int(seed))
         return "; ".join(f"{scale}: seed {', '.join(map(str, seeds))}" for scale, seeds in found.items())

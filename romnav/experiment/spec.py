@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from romnav.config import Config
+from romnav.config import Config, Label, Name, Seed
 from romnav.errors import RomnavError
 from romnav.parts import Kind
 
@@ -30,7 +30,7 @@ C = TypeVar("C", bound=Config)
 class Arm(Config, extra="allow"):
     """One arm: its label, and the scale's settings that it changes, e.g. ``navigation.ppo.gamma = 0.99``."""
 
-    label: str
+    label: Label
     """Name in lists."""
     policy: str | None = None
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
@@ -57,15 +57,15 @@ class Experiment(Config):
 
     kind: Literal["ablation", "safety", "deploy"]
     """What is done with the arms."""
-    title: str
+    title: Label
     """One line for lists."""
     tables: tuple[str, ...] = ()
     """Tables to write from the episode rows; without any, the arms are not evaluated."""
     curves: bool = False
     """Whether to draw and tabulate success while training, over all training seeds."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """Training seeds of every arm."""
-    arms: dict[str, Arm]
+    arms: dict[Name, Arm] = Field(min_length=1)
     """Arms by the name of their results folder."""
     scales: dict[str, dict[str, Any]] = Field(default={})
     """Settings that all arms change at a scale, e.g. ``scales.paper.navigation.env.envs = 3072``."""
@@ -85,40 +85,63 @@ class Experiment(Config):
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
-            changes = arm.changes
-            if not arm.trained and changes.keys() - {"navigation"} | changes.get("navigation", {}).keys() - BODY:
+            changed = arm.changes.get("navigation", {})
+            beside = arm.changes.keys() - {"navigation"}
+            if not arm.trained and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
                 what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
                 raise ValueError(f"{name} {what}, so it can only change navigation.dynamics")
             if arm.policy and arm.driver:
                 raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
 
+    @field_validator("seeds", "tables")
+    @classmethod
+    def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
+        if twice := [value for k, value in enumerate(values) if value in values[:k]]:
+            raise ValueError(f"{twice[0]} is there twice; name it once")
+        return values
 
-def load_experiments(folder: Path) -> dict[str, Experiment]:
+
+def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
     """Reads every ``<folder>/<name>.toml``.
 
-    Raises:
-        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings.
+    Returns:
+        Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
+        no arm, or gives an arm other settings than one before it. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
-    experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
-    drivers = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
-    seen: dict[str, tuple[str, Arm]] = {}
-    for name, experiment in experiments.items():
-        for scale in experiment.scales.keys() - known:
-            raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
-        for arm_name, arm in experiment.arms.items():
-            if arm.policy and arm.policy not in drivers:
-                raise RomnavError(
-                    f"{folder / name}.toml: arms.{arm_name}.policy: no arm {arm.policy} that is trained"
-                    f"{suggest(arm.policy, drivers)}"
-                )
-            first, same = seen.setdefault(arm_name, (name, arm))
-            if (same.changes, same.driver, experiments[first].scales) != (arm.changes, arm.driver, experiment.scales):
-                raise RomnavError(
-                    f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
-                )
-    return experiments
+    read: dict[str, Experiment] = {}
+    wrong: dict[str, RomnavError] = {}
+    for file in sorted(folder.glob("*.toml")):
+        try:
+            read[file.stem] = parse(Experiment, read_toml(file), file)
+        except RomnavError as error:
+            wrong[file.stem] = error
+    drivers = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
+    whole = not wrong  # an arm that is missed may be in what could not be read
+    experiments: dict[str, Experiment] = {}
+    for name, experiment in read.items():
+        if fault := _fault(experiment, experiments, known, drivers if whole else None):
+            wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
+        else:
+            experiments[name] = experiment
+    return experiments, wrong
+
+
+def _fault(
+    experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
+) -> str | None:
+    """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
+    for scale in experiment.scales.keys() - scales:
+        return f"scales: unknown scale {scale}{suggest(scale, scales)}"
+    for arm_name, arm in experiment.arms.items():
+        if arm.policy and drivers is not None and arm.policy not in drivers:
+            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
+        for first, other in before.items():
+            same = other.arms.get(arm_name)
+            if same and (same.changes, same.driver, other.scales) != (arm.changes, arm.driver, experiment.scales):
+                return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
+    return None
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -128,7 +151,7 @@ def read_toml(file: Path) -> dict[str, Any]:
         RomnavError: It is missing or no TOML.
     """
     try:
-        return tomllib.loads(file.read_text("utf-8"))
+        return tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
         raise RomnavError(f"{file}: cannot be read ({(error.strerror or str(error)).lower()})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -146,7 +169,7 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
         return model.model_validate_json(json.dumps(data, default=str))
     except ValidationError as invalid:
         error = invalid.errors()[0]
-        key = prefix + ".".join(map(str, error["loc"]))
+        key = (prefix + ".".join(str(part) for part in error["loc"] if part != "[key]")).rstrip(".")
         raise RomnavError(f"{file}: {_explain(model, key, error)}") from invalid
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.statistics import Estimate
 from romnav.report import paper
-from romnav.report.formats import Block, Cell, Row, Table, number
+from romnav.report.formats import Block, Cell, Row, Table, literal, number
 
 SHARE = 0.1
 """Part of the run over which success is averaged: a trailing window in the figure, the last one in the table."""
@@ -130,7 +130,7 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
         shown = np.isfinite(rates).all(axis=0)
         iteration, rates = iteration[shown], rates[:, shown]
         axes.fill_between(iteration, rates.min(axis=0), rates.max(axis=0), color=colour, alpha=0.2, linewidth=0)
-        axes.plot(iteration, rates.mean(axis=0), color=colour, label=curves.label)
+        axes.plot(iteration, rates.mean(axis=0), color=colour, label=literal(curves.label))
         if 0.0 < curves.unfreeze_at < 1.0:
             axes.axvline(round(curves.unfreeze_at * curves.iterations), color=colour, linestyle=":", linewidth=1)
     axes.set(xlabel="iteration", ylabel="success while training (%)", ylim=(0, None), xlim=(0, None))

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from romnav.robot.spec import RobotSpec
 from romnav.robot.statics import CUBE, FIELDS, OBSTACLES, VOLUMES, Geoms, Slots
+from romnav.threads import cores
 
 SIDES = ("left", "right")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -269,7 +270,7 @@ class Humanoids(Robots):
 
     def __init__(self, spec: RobotSpec, grounds: Sequence[Geoms], count: int, *, threads: int = 0) -> None:
         super().__init__(spec, grounds, count)
-        self._threads = threads
+        self._threads = threads or cores()
         self._open()
 
     def _open(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.cli.conftest import romnav
+from tests.cli.conftest import edit, romnav
 
 
 def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> None:
@@ -13,3 +13,17 @@ def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> N
     assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == files
     assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in lines]
     assert ["uniform-nocap", "UniformNoCap", "(RoM)"] in [line.split() for line in lines]
+
+
+def test_list_shows_the_others_beside_a_broken_file(evaluated: Path) -> None:
+    broken = evaluated / "experiments" / "search.toml"
+    edit(broken, "title =", "titel =")
+    (evaluated / "results" / "smoke" / "rom" / "seed-0.bak").mkdir()
+    (evaluated / "results" / "smoke" / "rom" / "seed-0.bak" / "episodes.parquet").write_bytes(b"old")
+    listed = romnav("list")
+    assert listed.exit_code == 1
+    assert listed.stderr.splitlines() == [f"error: {broken}: key title is missing"]
+    assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in listed.stdout.splitlines()]
+    assert romnav("results").exit_code == 0
+    assert romnav("tables", "spawn-goal").exit_code == 0
+    assert romnav("tables").stderr.splitlines()[-1] == f"error: {broken}: key title is missing"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,6 +33,8 @@ class Session:
     def __post_init__(self) -> None:
         if self.device == "cpu":
             return
+        if not re.fullmatch(r"cuda(:\d+)?", self.device):
+            raise RomnavError(f"device {self.device}: there is none of this name; use cpu, cuda or cuda:N")
         import torch
 
         try:
@@ -68,7 +71,9 @@ class Stage:
     upstream: tuple[Stage, ...] = ()
     """Stages whose output it reads."""
     scratch: tuple[str, ...] = ()
-    """Files from which an interrupted run continues; useless once a setting has changed."""
+    """Files from which an interrupted run continues; gone once it is finished."""
+    beside: tuple[str, ...] = ()
+    """Other files and folders of the same run, which go where its scratch goes."""
     command: tuple[str, ...] = ()
     """Words after ``romnav`` that make it alone, if there is such a command."""
     on_request: bool = False

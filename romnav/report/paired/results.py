@@ -21,7 +21,8 @@ def load(results_dir: Path, scale: str) -> list[rows.Arm]:
         RomnavError: There are none, one is unreadable, or they cannot be compared.
     """
     folder = results_dir / scale
-    files = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
+    found = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
+    files = [file for file in found if file.parts[-2].removeprefix("seed-").isdecimal()]
     if not files:
         raise NothingRecorded(
             f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`"
