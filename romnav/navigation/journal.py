@@ -38,13 +38,17 @@ class Journal:
         else:
             from torch.utils.tensorboard import SummaryWriter
 
-            self._writer = SummaryWriter(str(folder), purge_step=steps + 1, flush_secs=30)
+            self._writer = SummaryWriter(str(folder), purge_step=steps + 1)
 
     def add(self, row: Mapping[str, float]) -> None:
         """A row; what is not a number in it, as success before an episode ended, is left out."""
         for name, value in row.items():
             if name != "steps" and math.isfinite(value):
                 self._writer.add_scalar(_tag(name), value, int(row["steps"]))
+
+    def flush(self) -> None:
+        """Bring all rows so far to the disk."""
+        self._writer.flush()
 
     def close(self) -> None:
         """Nothing follows."""
