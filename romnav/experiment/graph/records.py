@@ -219,8 +219,7 @@ def _process() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Git commit of the code, with ``-dirty`` where code or experiments differ; its version where it is installed and lies
-    in no repository of its own."""
+    """Git commit of the code, with ``-dirty`` where code or experiments differ; where it is installed, its version."""
     root = Path(__file__).resolve().parents[3]
     if _git(root, "rev-parse", "--show-toplevel") != str(root):
         return f"v{__version__}"
