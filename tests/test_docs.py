@@ -1,4 +1,4 @@
-"""What the documentation says can be followed: links lead somewhere, commands exist, the tutorial's experiment is one."""
+"""What the documentation says can be followed: links lead somewhere, commands exist, the tutorial is an experiment."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def commands() -> Iterator[tuple[str, str]]:
                     yield named(page), found[1].partition("#")[0]
 
 
-@pytest.mark.parametrize(("page", "line"), commands())
+@pytest.mark.parametrize(("page", "line"), list(commands()))
 def test_commands_are_there_and_take_their_options(page: str, line: str) -> None:
     command, words = typer.main.get_command(app), shlex.split(line)
     context = command.make_context("romnav", words)
