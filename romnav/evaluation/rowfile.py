@@ -73,7 +73,7 @@ class RowFile:
         arrays = {field.name: pa.array(columns[field.name], type=field.type) for field in self.schema}
         with files.atomic(path) as file:
             table = pa.table(arrays, schema=self.schema.with_metadata(metadata))
-            pq.write_table(table, file, compression=self.compression)
+            pq.write_table(table, file, compression=self.compression, write_page_checksum=True)
 
     def read(self, path: Path, *facts: str) -> tuple[pa.Table, Provenance, dict[str, str]]:
         """Reads rows, where they come from, and the ``facts`` that hold for all of them.
@@ -82,7 +82,7 @@ class RowFile:
             RomnavError: The file is missing, truncated or of another schema.
         """
         try:
-            table = pq.ParquetFile(path).read()
+            table = pq.ParquetFile(path, page_checksum_verification=True).read()
         except FileNotFoundError as error:
             raise RomnavError(
                 f"{path}: no such file of {self.key}; {self.again.removesuffix(' again')} first"
