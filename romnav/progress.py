@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -84,9 +84,15 @@ def _plain(title: str, meter: Meter) -> Progress:
         line = meter.describe(done, total, metric)
         if done >= total or time.monotonic() - last >= PLAIN_INTERVAL:
             last = time.monotonic()
-            print(f"{title}  {line}", file=sys.stderr, flush=True)
+            _tell(f"{title}  {line}")
 
     return report
+
+
+def _tell(line: str) -> None:
+    """Prints to standard error; that nobody reads there any more stops no run."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def _rest() -> Column:
@@ -100,7 +106,7 @@ def _rest() -> Column:
 def lines(names: Sequence[str]) -> Iterator[Callable[[str, str], None]]:
     """Shows the latest line of each of several concurrent stages on standard error: (name, line)."""
     if not sys.stderr.isatty():
-        yield lambda name, line: print(line, file=sys.stderr, flush=True)
+        yield lambda name, line: _tell(line)
         return
     from rich.console import Console
     from rich.progress import Progress as Bars

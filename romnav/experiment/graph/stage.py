@@ -71,7 +71,9 @@ class Stage:
     upstream: tuple[Stage, ...] = ()
     """Stages whose output it reads."""
     scratch: tuple[str, ...] = ()
-    """Files from which an interrupted run continues; useless once a setting has changed."""
+    """Files from which an interrupted run continues; gone once it is finished."""
+    beside: tuple[str, ...] = ()
+    """Other files and folders of the same run, which go where its scratch goes."""
     command: tuple[str, ...] = ()
     """Words after ``romnav`` that make it alone, if there is such a command."""
     on_request: bool = False
