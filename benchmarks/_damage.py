@@ -111,8 +111,7 @@ def _read_scale(path: Path) -> Any:
 
 CURVE = RESULTS / "smoke" / "rom" / "seed-0" / "curve.csv"
 FILES = {
-    "policy": File(_copy(RESULTS / "smoke/rom/seed-0/policy.pt"), checkpoint.KIND.load),
-    "checkpoint": File(_copy(RESULTS / "cpu/rom/seed-0/checkpoint.pt"), checkpoint.KIND.load),
+    "policy or checkpoint": File(_copy(RESULTS / "smoke/rom/seed-0/policy.pt"), checkpoint.KIND.load),
     "encoder": File(_copy(RESULTS / "smoke/encoder/lidar/encoder.pt"), encoder.KIND.load),
     "locomotion policy": File(_copy(RESULTS / "cpu/locomotion/policy.pt"), locomotion.KIND.load),
     "gait library": File(_copy(RESULTS / "cpu/locomotion/gaits.pt"), gaits.KIND.load),
