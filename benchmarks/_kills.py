@@ -71,7 +71,9 @@ steps = 8
 EXPERIMENT = """
 kind = "ablation"
 title = "Two arms side by side"
-curves = true
+[tables.pair]
+kind = "curves"
+
 [arms.rom]
 label = "RoM"
 [arms.uniform]
@@ -86,7 +88,7 @@ import sys
 from romnav.navigation import train as policies
 from romnav.robot.locomotion import train as walking
 from romnav.sensing import pretrain
-policies.SAVE_EVERY = pretrain.SAVE_EVERY = 0.0
+policies.SAVE_EVERY, pretrain.CHECKPOINT_INTERVAL = 0.0, 1
 walking.train.__kwdefaults__["save_every"] = 0.0
 from romnav.cli import main
 main()
@@ -122,7 +124,7 @@ def kill(kind: str, trials: range, folder: Path) -> Counter[str]:
     project = _project(training, folder)
     begun = time.monotonic()
     if _run(training, project, "whole", None):
-        raise SystemExit(f"{kind}: fails without being killed")
+        raise SystemExit(f"{kind}: fails without being killed: {_said(project, 'whole')}")
     length = time.monotonic() - begun
     whole = _weights(training, project, "whole")
     count: Counter[str] = Counter()
@@ -132,6 +134,8 @@ def kill(kind: str, trials: range, folder: Path) -> Counter[str]:
         ended = _run(training, project, f"trial-{n}", None)
         same = not ended and _weights(training, project, f"trial-{n}") == whole
         count["same bits" if same else "lost"] += 1
+        if not same:
+            print(f"{kind} {n}: {'other weights' if not ended else _said(project, f'trial-{n}')}", flush=True)
         shutil.rmtree(project / f"trial-{n}", ignore_errors=True)
     return count
 
@@ -152,14 +156,17 @@ def _run(training: Training, project: Path, results: str, kill_after: float | No
         shutil.copytree(ROOT / "results/cpu/locomotion", project / results / "tiny" / "locomotion", dirs_exist_ok=True)
     command = [sys.executable, "-c", OFTEN, *training.words, "--scale", "tiny", "--results", str(project / results)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        command, cwd=project, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    with (project / f"{results}.log").open("w") as log:
+        process = subprocess.Popen(command, cwd=project, env=environment, stdout=subprocess.DEVNULL, stderr=log)
     try:
         return process.wait(kill_after if kill_after is not None else PATIENCE)
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGKILL)
         return process.wait()
+
+
+def _said(project: Path, results: str) -> str:
+    return (project / f"{results}.log").read_text()[-300:]
 
 
 def _weights(training: Training, project: Path, results: str) -> list[str]:

@@ -39,7 +39,7 @@ def check(collected: Mapping[str, Any], file: Path) -> list[str]:
             values = [run[metric] for run in runs if run.get(metric) is not None]
             value = fmean(values) if values else None
             shown = "missing" if value is None else f"{value:.4g}"
-            line = f"{arm} {metric} {shown}, band {low} to {high}"
+            line = f"{arm} {metric} {shown}, band {low:g} to {high:g}"
             lines.append(line)
             if value is None or not low <= value <= high:
                 failed.append(line)
