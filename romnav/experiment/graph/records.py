@@ -219,8 +219,10 @@ def _process() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Git commit of the code, with ``-dirty`` where code or experiments differ; "unknown" without git."""
-    root = Path(__file__).parents[3]
+    """Git commit of the code, with ``-dirty`` where code or experiments differ; where it is installed, its version."""
+    root = Path(__file__).resolve().parents[3]
+    if _git(root, "rev-parse", "--show-toplevel") != str(root):
+        return f"v{__version__}"
     head = _git(root, "rev-parse", "HEAD")
     changed = _git(root, "status", "--porcelain", "--", "romnav", "experiments/*.toml", "pyproject.toml")
     return f"{head or 'unknown'}{'-dirty' if changed else ''}"
