@@ -84,9 +84,10 @@ def read(work: Workspace, experiment: Experiment, runs: Sequence[Stage]) -> dict
 def tabulate(work: Workspace, name: str, arms: Mapping[str, Curves], runs: Sequence[Stage]) -> Table:
     """The table of the arms of finished training runs."""
     from romnav.report import curves
+    from romnav.report.provenance import distinct, short
 
-    made = [record.provenance["commit"][:12] for run in runs if (record := records.read(run))]
-    provenance = {"scale": work.scale, "commit": ", ".join(sorted(set(made)))}
+    made = distinct(short(record.provenance["commit"]) for run in runs if (record := records.read(run)))
+    provenance = {"scale": work.scale, "commit": made}
     sources = {arm: tuple(_source(run) for run in runs if run.arm == arm) for arm in arms}
     return curves.tabulate(name, work.project.experiment(name).title, arms, provenance, sources)
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from romnav import files
 from romnav.errors import RomnavError
-from romnav.experiment.graph.stage import Session, Stage, digest
+from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import NOISE
 from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.workspace import Workspace
+from romnav.files import digest
 from romnav.progress import Progress
 
 EPISODES = "dev"
