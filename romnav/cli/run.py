@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -72,14 +71,10 @@ def tables(
     """Write tables and figures again from what is recorded; nothing is trained or evaluated."""
     from romnav.experiment.kinds import reports
 
-    found = {
-        n: reports(job.work, n, job.project.experiment(n).seeds) for n in ([name] if name else job.project.experiments)
-    }
-    if name and not found[name]:
-        raise _no_reports(job.work, name)
+    names = [name] if name else job.project.experiments
     missing: list[NothingRecorded] = []
     drawn = []
-    for stage in itertools.chain(*found.values()):
+    for stage in (s for n in names for s in reports(job.work, n, job.project.experiment(n).seeds)):
         try:
             job.draw([stage])
         except NothingRecorded as error:
@@ -103,17 +98,7 @@ def _reports(work: Workspace, kind: str, name: str, seed: int | None) -> list[St
             f"{work.project.file(name)}: key kind is {experiment.kind}, not {kind}; "
             f"run `romnav run {experiment.kind} {name}`"
         )
-    found = reports(work, name, experiment.seeds if seed is None else (seed,))
-    if not found:
-        raise _no_reports(work, name)
-    return found
-
-
-def _no_reports(work: Workspace, name: str) -> RomnavError:
-    return RomnavError(
-        f"{work.project.file(name)}: has neither tables nor curves, so nothing is made of its arms; declare one, or "
-        "run `romnav train policy ARM` and `romnav eval ARM`"
-    )
+    return reports(work, name, experiment.seeds if seed is None else (seed,))
 
 
 def _seed(seed: int | None) -> tuple[str, ...]:

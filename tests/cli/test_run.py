@@ -18,13 +18,6 @@ from romnav.files import digest
 from tests.cli.conftest import edit, fails, romnav
 
 
-def test_an_experiment_of_which_nothing_is_made_says_so(project: Path) -> None:
-    file = project / "experiments" / "bare.toml"
-    file.write_text('kind = "ablation"\ntitle = "Bare"\n\n[arms.alone]\nlabel = "Alone"\n')
-    for words in (("run", "ablation", "bare"), ("tables", "bare")):
-        assert fails(*words).startswith(f"{file}: has neither tables nor curves")
-
-
 def test_edited_rows_are_not_shown(evaluated: Path) -> None:
     folder = evaluated / "results" / "smoke" / "rom" / "seed-0"
     recorded = {"episodes.parquet": digest(folder / "episodes.parquet")}
