@@ -8,7 +8,7 @@ product with the episodes' values: one matrix multiplication for every interval.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from romnav.errors import RomnavError
 from romnav.evaluation.intervals import mcnemar_mid_p, percentile_interval, resampled_sums
-from romnav.evaluation.paired.metrics import LEVELS, METRICS, Level, Metric, in_level, quantities
+from romnav.evaluation.paired.metrics import LEVELS, Level, Metric, find, in_level, quantities
 from romnav.evaluation.paired.rows import HORIZONS, Arm
 
 Cluster = Literal["episode", "tile"]
@@ -77,6 +77,7 @@ class Bootstrap:
         cluster: Unit that is resampled. By episode compares with the paper; by tile allows for episodes of
             one tile being alike.
         confidence: Coverage of the intervals.
+        outside: Names of metrics from outside that will be asked for.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class Bootstrap:
         seed: int = 0,
         cluster: Cluster = "episode",
         confidence: float = 0.95,
+        outside: Collection[str] = (),
     ) -> None:
         if not arms:
             raise RomnavError("no arms to compare; evaluate at least one")
@@ -95,7 +97,7 @@ class Bootstrap:
         columns = arms[0].runs[0].columns
         self._masks: dict[Level, NDArray] = {level: in_level(columns, level) for level in LEVELS}
         self._units = {level: len(np.unique(columns[cluster][mask])) for level, mask in self._masks.items()}
-        self._runs = [(arm.name, quantities(run.columns)) for arm in arms for run in arm.runs]
+        self._runs = [(arm.name, quantities(run.columns, outside)) for arm in arms for run in arm.runs]
         parts = [self._masks[level] for level in _DISJOINT]
         values = np.array([[[v * part for part in parts] for v in q.values()] for _, q in self._runs])
         order = np.argsort(columns[cluster], kind="stable")
@@ -106,13 +108,13 @@ class Bootstrap:
         self._seed_weights = {arm.name: _seed_weights(arm, resamples, seed) for arm in arms}
 
     def metric(self, arm: str, metric: str, level: Level = "all") -> Estimate:
-        """A metric of ``METRICS`` for one arm, pooled over its training seeds."""
-        value, draws = self._ratio(arm, METRICS[metric], level)
+        """A metric by name for one arm, pooled over its training seeds."""
+        value, draws = self._ratio(arm, find(metric), level)
         return Estimate(value, *self._interval(draws, level), n=int(self._masks[level].sum()))
 
     def contrast(self, a: str, b: str, metric: str = f"sr_{HORIZONS[-1]}", level: Level = "all") -> Contrast:
-        """Difference of two arms in a metric of ``METRICS``."""
-        m = METRICS[metric]
+        """Difference of two arms in a metric."""
+        m = find(metric)
         (value_a, draws_a), (value_b, draws_b) = self._ratio(a, m, level), self._ratio(b, m, level)
         interval, mask = self._interval(draws_a - draws_b, level), self._masks[level]
         a_only = b_only = mid_p = None

@@ -25,7 +25,7 @@ from romnav.files import digest, write
 ROOT = Path(__file__).resolve().parents[3]
 """Folder of the code, a repository's where it is not installed."""
 UNKNOWN = "unknown"
-"""Commit of code that no repository has."""
+"""Commit where git does not tell it."""
 _PACKAGES = ("torch", "rsl-rl-lib", "mujoco", "warp-lang", "numpy")
 
 
@@ -223,21 +223,21 @@ def _process() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Git commit of the code, with ``-dirty`` where code or experiments differ; "unknown" where git does not tell."""
-    head, top = _git("rev-parse", "HEAD", "--show-toplevel") or (UNKNOWN, "")
-    if Path(top).resolve() != ROOT:  # installed into a folder of another repository, say
-        return UNKNOWN
+    """Git commit of the code, with ``-dirty`` where code or experiments differ; where it is installed, its version."""
+    if not (ROOT / ".git").exists():
+        return f"v{__version__}"
+    head = _git("rev-parse", "HEAD")
     changed = _git("status", "--porcelain", "--", "romnav", "experiments/*.toml", "pyproject.toml")
-    return f"{head}{'-dirty' if changed else ''}"
+    return f"{head}{'-dirty' if changed else ''}" if head else UNKNOWN
 
 
-def _git(*arguments: str) -> list[str]:
-    """Lines that git prints; none where it fails."""
+def _git(*arguments: str) -> str:
+    """What git prints; nothing where it fails."""
     try:
         done = subprocess.run(["git", "-C", ROOT, *arguments], capture_output=True, text=True)
     except OSError:
-        return []
-    return done.stdout.splitlines() if done.returncode == 0 else []
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def _version(package: str) -> str:

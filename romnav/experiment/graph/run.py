@@ -119,7 +119,7 @@ def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None
         RomnavError: A stage cannot do or write what it should.
     """
     # looked up now: another commit may be checked out before a long stage ends
-    if records.provenance()["commit"] == records.UNKNOWN and (records.ROOT / ".git").exists():
+    if records.provenance()["commit"] == records.UNKNOWN:
         say(f"{records.ROOT}: git does not tell the commit, recorded as unknown; see what `git status` says there")
     for stage in stages:
         changed = "; ".join(records.differences(stage))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from romnav import __version__
 from romnav.experiment.graph import records
 
 
@@ -35,13 +36,13 @@ def test_the_commit_tells_of_changed_code(repository: Path) -> None:
     assert records.commit() == f"{head}-dirty"
 
 
-def test_code_installed_inside_another_repository_is_not_its_commit(
+def test_code_installed_inside_another_repository_has_its_version_not_that_commit(
     repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed = repository / ".venv" / "site-packages"
     installed.mkdir(parents=True)
     monkeypatch.setattr(records, "ROOT", installed)
-    assert records.commit() == "unknown"
+    assert records.commit() == f"v{__version__}"
 
 
 def test_a_repository_of_another_owner_is_unknown(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
