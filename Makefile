@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup lock demo test check tables bench nightly
+.PHONY: setup lock demo test check tables bench nightly numbers
 
 setup: $(VENV)/stamp
 
@@ -39,3 +39,6 @@ bench: setup
 nightly: setup
 	$(BIN)/romnav --results .cache/nightly run ablation spawn-goal --scale $(SCALE) --no-resume
 	$(BIN)/romnav --results .cache/nightly check --scale $(SCALE)
+
+numbers:
+	$(BIN)/python tools/numbers_in_pages.py
