@@ -91,7 +91,7 @@ class Runner:
         runtime = need("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
-        self._session, self.card = _open(runtime, path, options)
+        self.session, self.card = _open(runtime, path, options)
         self._directions = directions(self.card.lidar)
         self._mount = torch.tensor([0.0, 0.0, self.card.lidar.height])
         self._filter: SafetyFilter | None = None
@@ -131,7 +131,7 @@ class Runner:
         d_max = self.card.max_goal_distance
         seen = observe(robot, goal[None], angles[None, 1], self._previous, counters, lambda *_: images, d_max)
         fed = {name: seen[name].numpy() for name in (*images, "state")} | {"memory": self._memory}
-        command, self._memory = self._session.run(list(cards.OUTPUTS), fed)
+        command, self._memory = self.session.run(list(cards.OUTPUTS), fed)
         self._previous = torch.from_numpy(command.copy())
         safe, status = self._guard(robot, points, self._previous)
         return Velocity(safe, command[0], status, time.perf_counter() - began)

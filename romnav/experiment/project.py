@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from romnav import parts
 from romnav.errors import RomnavError
-from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, suggest
+from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, parse, read_toml, suggest
+from romnav.report.spec import PAIRED, Published
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,30 @@ class Project:
         """The file of an experiment."""
         return self.root / "experiments" / f"{experiment}.toml"
 
+    def published_files(self, experiment: str) -> tuple[Path, ...]:
+        """The file of results that an experiment prints beside ours, if it names one.
+
+        Raises:
+            RomnavError: There is no such file.
+        """
+        name = self.experiment(experiment).published
+        if name is None:
+            return ()
+        path = self.root / "experiments" / "published" / f"{name}.toml"
+        if not path.exists():
+            known = (file.stem for file in path.parent.glob("*.toml"))
+            raise RomnavError(f"{self.file(experiment)}: published: no {path.name}{suggest(name, known)}")
+        return (path,)
+
+    def published(self, experiment: str) -> Published | None:
+        """The results that an experiment prints beside ours.
+
+        Raises:
+            RomnavError: There is no such file, or it is invalid.
+        """
+        read = [parse(Published, read_toml(path), path) for path in self.published_files(experiment)]
+        return read[0] if read else None
+
     @property
     def arms(self) -> set[str]:
         """Names of all arms, trained and scripted."""
@@ -110,13 +136,23 @@ class Project:
         """Training seeds of an arm; a scripted one has only seed 0."""
         return (0,) if self.script(arm) else self.having(arm)[1].seeds
 
+    def comparisons(self, arms: Collection[str]) -> list[tuple[str, str]]:
+        """Pairs of some arms: those of each experiment with its reference, or with the first that is among them."""
+        pairs: dict[frozenset[str], tuple[str, str]] = {}
+        for bounds in ((), SCRIPTED):  # below all others
+            for experiment in self.experiments.values():
+                found = [arm for arm in (experiment.compared_with, *experiment.arms) if arm in arms]
+                for other in (arm for arm in (*found[1:], *bounds) if found and arm in arms and arm != found[0]):
+                    pairs.setdefault(frozenset((found[0], other)), (found[0], other))
+        return list(pairs.values())
+
     def overview(self) -> str:
         """Experiments, arms, and the training seeds evaluated at each scale, as text."""
         lines = []
         for name, experiment in self.experiments.items():
             lines.append(f"{name}: {experiment.title} ({experiment.kind})")
             labels = [*((arm, spec.label) for arm, spec in experiment.arms.items())]
-            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.tables]
+            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.declared(name, PAIRED).tables]
             lines += [f"  {arm:<16} {label:<22} {self._evaluated(arm)}".rstrip() for arm, label in labels]
         return "\n".join(lines)
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from romnav.config import Config, Label, Name, Seed
 from romnav.errors import RomnavError
 from romnav.parts import Kind
+from romnav.report.spec import PAIRED, Entry, TableKind, TableSpec
 
-SCRIPTED = ("oracle", "straight")
-"""Arms that need no training; every ablation is evaluated beside them."""
+SCRIPTED = {"oracle": "Oracle", "straight": "Straight"}
+"""Arms that need no training, and their labels; every ablation is evaluated beside them."""
 DRIVERS = Kind("scripted driver", "romnav.drivers", "romnav.evaluation.rollout:Driver")
 RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
 """Names of other folders beside those of the arms: figures, and one for a kind of stage."""
@@ -52,6 +53,14 @@ TrialKind = Literal["safety", "deploy"]
 """Experiments that drive arms through scenes, with the safety filter off and on."""
 
 
+class Declared(Config):
+    """Tables of an experiment, complete, with what they need of it."""
+
+    title: str
+    labels: dict[str, str]
+    tables: dict[str, TableSpec]
+
+
 class Experiment(Config):
     """Arms that are trained alike except for their changes, and evaluated on the same episodes or trials."""
 
@@ -59,10 +68,13 @@ class Experiment(Config):
     """What is done with the arms."""
     title: Label
     """One line for lists."""
-    tables: tuple[str, ...] = ()
-    """Tables to write from the episode rows; without any, the arms are not evaluated."""
-    curves: bool = False
-    """Whether to draw and tabulate success while training, over all training seeds."""
+    tables: dict[Name, TableSpec] = Field(default={})
+    """Tables to write, by the name of their files; without any, the usual ones. What none of them needs is not run:
+    where all are of learning curves, the arms are not evaluated."""
+    reference: str = ""
+    """Arm that the others are compared with; empty is the first."""
+    published: Name | None = None
+    """Results to print beside ours: a file under experiments/published/."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """Training seeds of every arm."""
     arms: dict[Name, Arm] = Field(min_length=1)
@@ -74,6 +86,39 @@ class Experiment(Config):
     def labels(self) -> dict[str, str]:
         """Label of every arm."""
         return {name: arm.label for name, arm in self.arms.items()}
+
+    @property
+    def compared_with(self) -> str:
+        """The reference arm."""
+        return self.reference or next(iter(self.arms))
+
+    def declared(self, name: str, kinds: Collection[TableKind]) -> Declared:
+        """The tables of some kinds, completed; ``name`` is the experiment's."""
+        if self.kind != "ablation":
+            usual = {name: TableSpec(kind="trials")}
+        else:
+            usual = {name: TableSpec(bounds=_entries(SCRIPTED))}
+            if len(self.arms) > 1:
+                usual[f"{name}-contrasts"] = TableSpec(kind="contrasts", bounds=_entries(SCRIPTED))
+        tables = {n: self._complete(t) for n, t in (self.tables or usual).items() if t.kind in kinds}
+        return Declared(title=self.title, labels=self.labels, tables=tables)
+
+    def _complete(self, table: TableSpec) -> TableSpec:
+        if table.kind not in PAIRED:
+            return table
+        labels = SCRIPTED | self.labels
+        reference = table.reference.arm or self.compared_with
+        others = [arm for arm in self.arms if table.kind != "contrasts" or arm != reference]
+
+        def labelled(entries: Iterable[Entry], **update: Any) -> tuple[Entry, ...]:
+            return tuple(e.model_copy(update={"label": e.label or labels[e.arm], **update}) for e in entries)
+
+        update = {
+            "reference": labelled([table.reference.model_copy(update={"arm": reference})])[0],
+            "rows": tuple(map(labelled, table.rows or (_entries(others),))),
+            "bounds": labelled(table.bounds, competes=False),
+        }
+        return table.model_copy(update=update)
 
     def driver(self, arm: str) -> str:
         """The arm whose policy drives ``arm``."""
@@ -94,12 +139,31 @@ class Experiment(Config):
                 raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
 
-    @field_validator("seeds", "tables")
+    @field_validator("seeds")
     @classmethod
     def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
         if twice := [value for k, value in enumerate(values) if value in values[:k]]:
             raise ValueError(f"{twice[0]} is there twice; name it once")
         return values
+
+    @model_validator(mode="after")
+    def _tables_of_its_arms(self) -> Experiment:
+        known = {*self.arms, *SCRIPTED}
+        if self.reference and self.reference not in known:
+            raise ValueError(f"reference: no arm {self.reference}{suggest(self.reference, known)}")
+        for name, table in self.tables.items():
+            if (table.kind == "trials") != (self.kind != "ablation"):
+                raise ValueError(f"tables.{name}.kind: {table.kind} is no table of an experiment of kind {self.kind}")
+            for arm in (table.reference.arm, *(entry.arm for entry in table.entries)):
+                if arm and arm not in known:
+                    raise ValueError(f"tables.{name}: no arm {arm}{suggest(arm, known)}")
+            if table.kind == "contrasts" and not table.rows and len(self.arms) < 2:
+                raise ValueError(f"tables.{name}: there is one arm; contrasts are of several")
+        return self
+
+
+def _entries(arms: Iterable[str]) -> tuple[Entry, ...]:
+    return tuple(Entry(arm=arm) for arm in arms)
 
 
 def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
@@ -107,7 +171,7 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
 
     Returns:
         Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
-        no arm, or gives an arm other settings than one before it. They do not take the others down.
+        no arm, or gives another arm or table a name of one before it. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
     read: dict[str, Experiment] = {}
@@ -121,7 +185,7 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
     whole = not wrong  # an arm that is missed may be in what could not be read
     experiments: dict[str, Experiment] = {}
     for name, experiment in read.items():
-        if fault := _fault(experiment, experiments, known, drivers if whole else None):
+        if fault := _fault(name, experiment, experiments, known, drivers if whole else None):
             wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
         else:
             experiments[name] = experiment
@@ -129,11 +193,16 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
 
 
 def _fault(
-    experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
+    name: str, experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
 ) -> str | None:
     """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
     for scale in experiment.scales.keys() - scales:
         return f"scales: unknown scale {scale}{suggest(scale, scales)}"
+    every = get_args(TableKind)
+    for table in experiment.declared(name, every).tables:
+        for first, other in before.items():
+            if table in other.declared(first, every).tables:
+                return f"tables.{table}: {first}.toml has a table of this name; rename one"
     for arm_name, arm in experiment.arms.items():
         if arm.policy and drivers is not None and arm.policy not in drivers:
             return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"

@@ -164,7 +164,8 @@ class NavigationEnv(VecEnv):
         """Drive all robots for one period; finished ones start anew before they are observed."""
         reward, fallen, timeout = self.advance(actions)
         done = timeout | fallen
-        self.restart(done.nonzero()[:, 0])
+        ended = done.nonzero()[:, 0]
+        self.restart(ended)
         return self.get_observations(), reward, done, {"time_outs": timeout}
 
     def advance(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

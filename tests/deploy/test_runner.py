@@ -56,14 +56,14 @@ def cloud(ranges: np.ndarray, roll: float = 0.0, pitch: float = 0.0) -> np.ndarr
 
 def test_it_observes_as_the_simulator_does(runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     fed: list[dict[str, np.ndarray]] = []
-    real = runner._session
+    real = runner.session
 
     class Session:
         def run(self, names: list[str], inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
             fed.append(inputs)
             return real.run(names, inputs)
 
-    monkeypatch.setattr(runner, "_session", Session())
+    monkeypatch.setattr(runner, "session", Session())
     runner.reset()
     first, _ = runner(sensed()), runner(sensed())
     position, yaw, goal, goal_yaw = (torch.tensor([x]) for x in ([1.0, 2.0, 0.0], 0.5, [4.0, 1.0, 3.0], -1.0))

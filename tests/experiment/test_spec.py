@@ -15,7 +15,6 @@ ROOT = Path(__file__).parents[2]
 EXPERIMENT = """
 kind = "ablation"
 title = "t"
-tables = ["a"]
 [arms.rom]
 label = "RoM"
 [arms.slow]
@@ -96,6 +95,32 @@ def test_an_invalid_experiment_is_one_clear_error(tmp_path: Path, text: str, mes
     file = tmp_path / "e.toml"
     file.write_text(text)
     assert fault(tmp_path, "e").startswith(f"{file}: {message}")
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ('[tables.x]\nkin = "contrasts"', "unknown key tables.x.kin; did you mean kind?"),
+        ('[tables.x]\nrows = ["rmo"]', "tables.x: no arm rmo; did you mean rom?"),
+        ('[tables.x]\nkind = "trials"', "tables.x.kind: trials is no table of an experiment of kind ablation"),
+        ('[tables.x]\nkind = "curves"\nrows = ["rom"]', "tables.x: a table of kind curves has no rows to choose"),
+        (
+            '[tables."a/b"]',
+            "tables.a/b: 'a/b' names no file; use up to 64 letters, digits and . _ + -, a letter or digit first",
+        ),
+        ('[tables.x]\ncolumns = [{ header = "H" }]', "key tables.x.columns.0.metric is missing"),
+    ],
+)
+def test_an_invalid_table_is_one_clear_error(tmp_path: Path, tables: str, message: str) -> None:
+    file = tmp_path / "e.toml"
+    file.write_text(f"{EXPERIMENT}{tables}\n")
+    assert fault(tmp_path, "e") == f"{file}: {message}"
+
+
+def test_a_table_has_one_experiment(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.toml").write_text(f"{EXPERIMENT}[tables.mine]\n")
+    assert "b.toml: tables.mine: a.toml has a table of this name; rename one" in fault(tmp_path, "b")
 
 
 def test_an_arm_of_two_experiments_is_the_same_arm(tmp_path: Path) -> None:

@@ -54,17 +54,20 @@ def require(stage: Stage, reader: Stage) -> None:
     Raises:
         RomnavError: It is not, or was made with other settings.
     """
+    if reason := missing(stage):
+        command = shlex.join(("romnav", *stage.command))
+        raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
+
+
+def missing(stage: Stage) -> str:
+    """Why a stage is not finished, as the end of a sentence; empty if it is."""
     if records.finished(stage):
-        return
-    changed = "; ".join(records.differences(stage))
-    if changed:
-        reason = f"was made with other settings ({changed})"
-    elif stage.record.exists():
-        reason = "is unfinished, or something that it was made from has changed since"
-    else:
-        reason = "is missing"
-    command = shlex.join(("romnav", *stage.command))
-    raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
+        return ""
+    if changed := "; ".join(records.differences(stage)):
+        return f"was made with other settings ({changed})"
+    if stage.record.exists():
+        return "is unfinished, or something that it was made from has changed since"
+    return "is missing"
 
 
 def with_all_above(stages: Iterable[Stage]) -> list[Stage]:
