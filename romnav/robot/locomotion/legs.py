@@ -58,10 +58,15 @@ class Legs:
         self._first[..., :3, :3] = turn @ cross
         self._second[..., :3, :3] = turn @ cross @ cross
         self._axis = torch.eye(4)[axes][..., None]
-        self._axes = torch.tensor(axes, dtype=torch.int32)
         self.limits = torch.tensor(limits, dtype=torch.float32)
         straight = torch.tensor([0.0, 0.0, 0.0, STRAIGHT, 0.0, 0.0]).expand(1, 2, 6)
-        self._reach = (self.forward(straight)[0] - self._fixed[:, 0, :3, 3]).norm(dim=-1)[0]
+        reach = (self.forward(straight)[0] - self._fixed[:, 0, :3, 3]).norm(dim=-1)[0]
+        self._chain = [
+            wp.from_torch(self._fixed, dtype=wp.mat44),
+            wp.from_torch(torch.tensor(axes, dtype=torch.int32)),
+            wp.from_torch(self.limits, dtype=wp.vec2),
+            wp.from_torch(reach),
+        ]
 
     def forward(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ankle position (n, 2, 3), rotation (n, 2, 3, 3) and the Jacobian (n, 2, 6, 6) of (position, rotation)."""
@@ -93,10 +98,7 @@ class Legs:
         inputs = [
             wp.from_torch(position.contiguous(), dtype=wp.vec3),
             wp.from_torch(turn.contiguous(), dtype=wp.mat33),
-            wp.from_torch(self._fixed, dtype=wp.mat44),
-            wp.from_torch(self._axes),
-            wp.from_torch(self.limits, dtype=wp.vec2),
-            wp.from_torch(self._reach),
+            *self._chain,
             iterations,
             damping,
         ]
