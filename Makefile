@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup lock demo test check tables bench docs nightly
+.PHONY: setup lock demo test check tables numbers bench docs nightly
 
 setup: $(VENV)/stamp
 
@@ -43,3 +43,7 @@ docs: setup
 nightly: setup
 	$(BIN)/romnav --results .cache/nightly run ablation spawn-goal --scale $(SCALE) --no-resume
 	$(BIN)/romnav --results .cache/nightly check --scale $(SCALE)
+	$(BIN)/python benchmarks/faults.py --out .cache/nightly/bench
+
+numbers: setup
+	$(BIN)/python tools/numbers_in_pages.py
