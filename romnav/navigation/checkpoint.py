@@ -31,7 +31,8 @@ def load_actor(
     ``depth_encoder``.
 
     Raises:
-        RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec, or are not finite.
+        RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec or are not
+            finite.
     """
     content = read(path, device)
     own = any(name.startswith("encoder.") for name in content["actor"])
