@@ -207,7 +207,7 @@ def shares(learner: Learner, iterations: int) -> dict[str, float]:
     watch.wrap(eye.encoder, "tokens", "encoder")
     watch.wrap(env.dynamics, "step", "dynamics")
     watch.wrap(env, "_lookup", "geodesic lookup")
-    watch.wrap(env, "_reset", "resets")
+    watch.wrap(env, "restart", "resets")
     watch.wrap(env, "step", "observations, rewards")
     watch.wrap(ppo, "act", "policy inference")
     watch.wrap(ppo, "process_env_step", "storage, returns")
