@@ -64,7 +64,7 @@ class Scale(Config):
         env, cell = self.navigation.env, self.world.grid.cell
         if (way := env.command.forward * env.period) > 2 * cell:
             raise ValueError(
-                f"navigation.env.period: {way:.2f} m in a step at the fastest command (navigation.env.command.forward), "
+                f"navigation.env.period: {way:.2f} m in a step at navigation.env.command.forward, "
                 f"beyond two cells of {cell} m (world.grid.cell): robots would jump over walls; lower it"
             )
         for name in ("evaluation", "safety", "deploy"):
@@ -76,9 +76,10 @@ class Scale(Config):
                 )
         return self
 
-    def on_body(self, dynamics: str) -> Scale:
+    def on_body(self, dynamics: str, stair_speed: float | None = None) -> Scale:
         """The same with robots of another body."""
-        return self.model_copy(update={"navigation": self.navigation.model_copy(update={"dynamics": dynamics})})
+        other = {"dynamics": dynamics, "stair_speed": stair_speed}
+        return self.model_copy(update={"navigation": self.navigation.model_copy(update=other)})
 
 
 class ScaleFile:
