@@ -26,6 +26,7 @@ from romnav.sensing import encoder as checkpoints
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.spec import UPRIGHT, CorruptionSpec, PretrainSpec, SwaySpec
+from romnav.tensors import not_finite
 from romnav.threads import torch_threads
 from romnav.world.grids import Grids
 from romnav.world.solids import Label
@@ -263,8 +264,7 @@ class _Training:
 
     def check(self) -> None:
         """Stop before weights that are not finite are saved."""
-        wrong = [name for name, value in self.model.state_dict().items() if not bool(value.isfinite().all())]
-        if wrong:
+        if wrong := not_finite(self.model.state_dict()):
             raise RomnavError(
                 f"pretraining: step {self.step}: {', '.join(wrong[:3])} not finite; what is saved is of a step before. "
                 "Lower learning_rate"
