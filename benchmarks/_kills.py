@@ -45,6 +45,9 @@ epochs = 1
 widths = [8, 8]
 strides = [[2, 2], [2, 2]]
 latent = 8
+[quality]
+images = 32
+tiles = 2
 [navigation.env]
 envs = 16
 duration = 10.0

@@ -78,10 +78,11 @@ def _told(kind: str) -> str:
 def table(counts: dict[str, Any]) -> str:
     """The counts as Markdown."""
     parts = []
-    if counts.get("damages"):
+    if any(counts.get("damages", {}).values()):
         rows = [
             [_told(kind), str(sum(found.values())), *(str(found.get(name, 0)) for name in _damage.OUTCOMES)]
             for kind, found in counts["damages"].items()
+            if found
         ]
         parts.append(markdown(["file", "damaged", *_damage.OUTCOMES], rows))
     for part, good, head in (("kills", "same bits", "killed and resumed"), ("warp", "same bits", "race")):

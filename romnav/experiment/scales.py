@@ -76,9 +76,10 @@ class Scale(Config):
                 )
         return self
 
-    def on_body(self, dynamics: str) -> Scale:
+    def on_body(self, dynamics: str, stair_speed: float | None = None) -> Scale:
         """The same with robots of another body."""
-        return self.model_copy(update={"navigation": self.navigation.model_copy(update={"dynamics": dynamics})})
+        other = {"dynamics": dynamics, "stair_speed": stair_speed}
+        return self.model_copy(update={"navigation": self.navigation.model_copy(update=other)})
 
 
 class ScaleFile:

@@ -56,6 +56,7 @@ class Humanoid:
         *,
         seed: int = 0,
         threads: int = 0,
+        stair_speed: float | None = None,
     ) -> None:
         """
         Args:
@@ -66,11 +67,13 @@ class Humanoid:
             gaits: recorded from it.
             seed: of first feet and times along gaits.
             threads: of the physics; 0 means all cores. They do not change the result.
+            stair_speed: fastest forward command followed while the next foothold is not level with the feet, m/s.
 
         Raises:
             RomnavError: the checkpoint is missing, or the period is no multiple of the control step.
         """
         self.world, self.period, self.gaits, self.seed = world, period, gaits, seed
+        self.stair_speed = stair_speed
         self._spec, self._policy, _ = load_policy(checkpoint)
         self._heights = TileHeights(world.tiles)
         self.tile = torch.zeros(envs, dtype=torch.int64)
@@ -192,8 +195,9 @@ class Humanoid:
         """Walk under the command (E, 3) for one period; who has fallen stays down."""
         touched, kicked = torch.zeros_like(self.robots.touch), torch.zeros_like(self.robots.kicks)
         for _ in range(self._ticks):
-            self.control.refer(command, self._heights, self._first)
-            action = self._policy(self.control.observe(command, self._heights))
+            followed = self._followed(command)
+            self.control.refer(followed, self._heights, self._first)
+            action = self._policy(self.control.observe(followed, self._heights))
             self.control.act(action, (~self.fallen).nonzero()[:, 0])
             self._first = torch.zeros_like(self._first)
             touched |= self.robots.touch
@@ -202,6 +206,16 @@ class Humanoid:
         touched[:, self.robots.feet] = kicked
         self.contacts = touched.sum(1).float()
         self._read()
+
+    def _followed(self, command: Tensor) -> Tensor:
+        """Commands (E, 3), slower on stairs if there is a limit."""
+        if self.stair_speed is None:
+            return command
+        walker = self.control.walker
+        steep = ((walker.foothold[:, 2] - walker.base).abs() > self._spec.gait.level) & ~self._first
+        slow = command.clone()
+        slow[:, 0] = command[:, 0].clamp(max=self.stair_speed)
+        return torch.where(steep[:, None], slow, command)
 
     def _read(self) -> None:
         """Poses and layers from the physics."""

@@ -222,6 +222,21 @@ def test_who_has_fallen_is_reported_and_stays_down(world: World, checkpoint: Pat
     assert not body.fallen.any()
 
 
+def test_a_limit_on_stairs_slows_who_steps_up_or_down_and_nobody_else(world: World, checkpoint: Path) -> None:
+    body = Humanoid(world, 3, 0.2, checkpoint, GaitLibrary([]), threads=1, stair_speed=0.4)
+    body.reset(torch.arange(3), starts(world, level_nodes(world, 3), torch.zeros(3)))
+    command = torch.tensor([[0.8, 0.1, 0.5], [0.8, 0.1, 0.5], [-0.3, 0.1, 0.5]])
+    assert torch.equal(body._followed(command), command)
+    body.step(0.0 * command)
+    body.control.walker.foothold[:, 2] = body.control.walker.base + torch.tensor([0.02, -0.15, 0.15])
+    followed = body._followed(command)
+    assert followed.tolist() == [
+        command[0].tolist(),
+        [torch.tensor(0.4).item(), *command[1, 1:].tolist()],
+        command[2].tolist(),
+    ]
+
+
 def test_the_period_is_a_multiple_of_the_control_step(world: World, checkpoint: Path) -> None:
     with pytest.raises(RomnavError, match="multiple of the control step"):
         Humanoid(world, 1, 0.19, checkpoint, GaitLibrary([]), threads=1)

@@ -115,13 +115,15 @@ def body(work: Workspace, settings: Scale, seed: int, device: str, threads: int)
         case "rom":
             return ReducedOrderModel
         case "g1":
-            return humanoid(work, seed, device, threads)
+            return humanoid(work, settings, seed, device, threads)
         case outside:
             made: Body = BODIES.load(outside)
             return made
 
 
-def humanoid(work: Workspace, seed: int, device: str, threads: int) -> Callable[[World, int, float], Humanoid]:
+def humanoid(
+    work: Workspace, settings: Scale, seed: int, device: str, threads: int
+) -> Callable[[World, int, float], Humanoid]:
     """What makes robots that walk by the locomotion policy of the scale.
 
     Raises:
@@ -138,4 +140,5 @@ def humanoid(work: Workspace, seed: int, device: str, threads: int) -> Callable[
         gaits=GaitLibrary.load(gaits(work).folder / "gaits.pt"),
         seed=seed,
         threads=threads,
+        stair_speed=settings.navigation.stair_speed,
     )

@@ -78,7 +78,7 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
         settings.navigation.env,
         spec,
         progress,
-        body=humanoid(driven.work, driven.seed, session.device, spec.threads) if walks else None,
+        body=humanoid(driven.work, settings, driven.seed, session.device, spec.threads) if walks else None,
         arms=settings.locomotion.robot if walks else None,
     )
     provenance = driven.provenance(stage, draw(scenes, world, spec).digest, spec)
