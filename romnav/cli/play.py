@@ -67,3 +67,25 @@ def episodes(
     typer.echo(f"{len(chosen)} episodes: {', '.join(map(str, chosen[:20]))}{', ...' if len(chosen) > 20 else ''}")
     seen.draw(chosen[:count], path)
     typer.echo(path)
+
+
+@command(play, "episode")
+def episode(
+    at: AtScale,
+    arm: ArmArgument,
+    number: Annotated[int, typer.Argument(metavar="EPISODE", min=0, help="Number of the episode.")],
+    out: Annotated[
+        Path | None, typer.Option(help="MP4 or GIF to write; default: results/<scale>/figures/<arm>-<episode>.mp4.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.1, help="Times as fast as it was.")] = 2.0,
+    size: Annotated[int, typer.Option(min=64, help="Height of the picture, pixels; it is twice as wide.")] = 480,
+    seed: Annotated[int, typer.Option("--seed", help="Training seed.")] = 0,
+) -> None:
+    """Film an episode of an arm, from behind and from above; the humanoid with its meshes."""
+    from romnav.experiment.kinds.replays import Again
+    from romnav.progress import bar
+
+    path = out or at.work.folder / "figures" / f"{arm}-{number}.mp4"
+    with bar(f"film of {arm}, episode {number}") as progress:
+        Again(at.work, arm, seed).film(number, path, speed, size, progress)
+    typer.echo(path)

@@ -78,7 +78,12 @@ def _inclined(solids: Solids) -> NDArray[np.bool_]:
     return (solids.slope_top != 0) | (solids.slope_bottom != 0)
 
 
-def _add_upright(model: mujoco.MjSpec, solid: Solids) -> None:
+def add_solid(model: mujoco.MjSpec, solid: Solids) -> Any:
+    """Add one solid: a walking surface to the world body, an obstacle to the body `OBSTACLES`; returns the geom."""
+    return (_add_mesh if _inclined(solid)[0] else _add_upright)(model, solid)
+
+
+def _add_upright(model: mujoco.MjSpec, solid: Solids) -> Any:
     (x, y), (u, v), yaw = solid.centre[0], solid.half[0], solid.yaw[0]
     middle, half = (solid.top[0] + solid.bottom[0]) / 2, (solid.top[0] - solid.bottom[0]) / 2
     if solid.shape[0] == Shape.CYLINDER:
@@ -86,14 +91,14 @@ def _add_upright(model: mujoco.MjSpec, solid: Solids) -> None:
     else:
         shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [u, v, half]}
         shape["quat"] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
-    _body(model, solid).add_geom(pos=[x, y, middle], **shape, **_TOUCH)
+    return _body(model, solid).add_geom(pos=[x, y, middle], **shape, **_TOUCH)
 
 
-def _add_mesh(model: mujoco.MjSpec, solid: Solids) -> None:
+def _add_mesh(model: mujoco.MjSpec, solid: Solids) -> Any:
     mesh = model.add_mesh(name=f"solid{len(model.meshes)}")
     exact = triangulate(_blunt(solid))
     mesh.uservert, mesh.userface = exact.vertices.flatten(), exact.triangles.flatten()
-    _body(model, solid).add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **_TOUCH)
+    return _body(model, solid).add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **_TOUCH)
 
 
 def _body(model: mujoco.MjSpec, solid: Solids) -> Any:
