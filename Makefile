@@ -4,15 +4,18 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test check tables bench nightly
+.PHONY: setup lock demo test check tables bench nightly
 
 setup: $(VENV)/stamp
 
-$(VENV)/stamp: pyproject.toml
+$(VENV)/stamp: pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "error: $(PYTHON) is older than 3.11; use make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock -e '.[dev]'
 	@touch $@
+
+lock:
+	$(BIN)/python tools/lock.py
 
 demo: setup
 	$(BIN)/romnav --results .cache/demo run ablation spawn-goal --scale smoke

@@ -16,9 +16,10 @@ from typing import Any
 
 from romnav import files
 from romnav.experiment.graph import records
+from romnav.threads import cores
 
 ROOT = Path(__file__).parents[1]
-CORES = os.cpu_count() or 1
+CORES = cores()
 
 
 def arguments(description: str | None, **options: int) -> argparse.Namespace:

@@ -52,7 +52,7 @@ def ours(arms: list[Arm]) -> NDArray:
     bootstrap = Bootstrap(arms, resamples=RESAMPLES)
     found = [bootstrap.metric(arm.name, metric, level) for arm in arms for metric in SHOWN for level in LEVELS]
     contrasts = [
-        bootstrap.contrast(a.name, b.name, horizon, level)
+        bootstrap.contrast(a.name, b.name, f"sr_{horizon}", level)
         for a, b in combinations(arms, 2)
         for horizon in HORIZONS
         for level in LEVELS

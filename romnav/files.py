@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,9 @@ HINTS = {
     errno.EACCES: "make its folder writable",
     errno.EPERM: "make its folder writable",
     errno.EROFS: "make its folder writable",
+    errno.EEXIST: "move away what is in its place",
+    errno.ENOTDIR: "move away what is in its place",
+    errno.EISDIR: "move away what is in its place",
 }
 
 
@@ -39,6 +43,22 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
         except BaseException:
             part.unlink(missing_ok=True)
             raise
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def prepare(path: Path) -> None:
+    """Makes the folder of a file that is to be written after long work, and makes sure that it can be.
+
+    Raises:
+        RomnavError: It cannot.
+    """
+    if path.is_dir():
+        raise RomnavError(f"{path}: cannot be written (is a folder); move it away")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise unwritable(path, error) from error
 

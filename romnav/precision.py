@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 
 import torch
+
+_FULL = ContextVar("full precision", default=False)
 
 
 @cache
@@ -21,7 +26,17 @@ def multiplies_bfloat16(device: str) -> bool:
 
 def product_dtype(device: torch.device) -> torch.dtype:
     """Type in which dense products are fastest on ``device``: bfloat16 or float32."""
-    return torch.bfloat16 if multiplies_bfloat16(device.type) else torch.float32
+    return torch.bfloat16 if multiplies_bfloat16(device.type) and not _FULL.get() else torch.float32
+
+
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """Within it, every product is in float32, as on other machines."""
+    before = _FULL.set(True)
+    try:
+        yield
+    finally:
+        _FULL.reset(before)
 
 
 def reduced_precision(device: torch.device, wanted: bool = True) -> torch.autocast:

@@ -5,7 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Column
 
 Progress = Callable[[int, int, str], None]
 """What a long computation is given to report on itself: (units done, units in all, text of its metric)."""
@@ -58,13 +62,14 @@ def bar(title: str) -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
+    from rich.table import Column
 
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(24),
-        TextColumn("{task.fields[text]}", markup=False),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, min_width=len(title))),
+        BarColumn(12),
+        TextColumn("{task.fields[text]}", markup=False, table_column=_rest()),
     )
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    with Bars(*columns, console=Console(stderr=True), expand=True) as bars:
         task = bars.add_task(title, total=None, text="")
         yield lambda done, total, metric: bars.update(
             task, completed=done, total=total, text=meter.describe(done, total, metric)
@@ -79,22 +84,35 @@ def _plain(title: str, meter: Meter) -> Progress:
         line = meter.describe(done, total, metric)
         if done >= total or time.monotonic() - last >= PLAIN_INTERVAL:
             last = time.monotonic()
-            print(f"{title}  {line}", file=sys.stderr, flush=True)
+            _tell(f"{title}  {line}")
 
     return report
+
+
+def _tell(line: str) -> None:
+    """Prints to standard error; that nobody reads there any more stops no run."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def _rest() -> Column:
+    """A column of the terminal's remaining width, its text cut at the end rather than wrapped."""
+    from rich.table import Column
+
+    return Column(ratio=1, no_wrap=True, overflow="ellipsis")
 
 
 @contextmanager
 def lines(names: Sequence[str]) -> Iterator[Callable[[str, str], None]]:
     """Shows the latest line of each of several concurrent stages on standard error: (name, line)."""
     if not sys.stderr.isatty():
-        yield lambda name, line: print(line, file=sys.stderr, flush=True)
+        yield lambda name, line: _tell(line)
         return
     from rich.console import Console
     from rich.progress import Progress as Bars
     from rich.progress import SpinnerColumn, TextColumn
 
-    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False)
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False, table_column=_rest())
+    with Bars(*columns, console=Console(stderr=True), expand=True) as bars:
         tasks = {name: bars.add_task(name, total=None) for name in names}
         yield lambda name, line: bars.update(tasks[name], description=line)

@@ -9,6 +9,7 @@ import pytest
 
 from romnav.evaluation.paired import rows
 from romnav.evaluation.trials import rows as trial_rows
+from romnav.world.spec import SMALLEST
 
 
 def _episode_rows(
@@ -28,7 +29,7 @@ def _episode_rows(
         "seed": np.full(n, seed),
         "episode": np.arange(n),
         "tile": np.arange(n) // 8,
-        "tile_class": np.array(rows.TILE_CLASSES)[np.arange(n) % 3],
+        "tile_class": np.array(list(SMALLEST))[np.arange(n) % 3],
         "multi_story": np.arange(n) % 3 == 2,
         **poses,
         "geodesic": geodesic,

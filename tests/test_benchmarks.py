@@ -8,11 +8,13 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -85,3 +87,26 @@ def test_shares_cover_the_iteration(training: ModuleType, learners: dict[str, An
     assert sum(parts.values()) == pytest.approx(1.0)
     assert {"LiDAR", "encoder", "update: attention", "update: GRU", "policy inference"} < parts.keys()
     assert min(parts[k] for k in training.SENSING if k != "resets") > 0.0
+
+
+@given(
+    st.lists(st.tuples(st.floats(1, 100), st.sets(st.integers(0, 11), max_size=3)), min_size=1, max_size=12),
+    st.integers(1, 5),
+)
+@settings(max_examples=60, deadline=None)
+def test_simulated_stages_keep_order_and_bounds(common: ModuleType, drawn: Any, cores: int) -> None:
+    """Without chance, the end lies between the critical path and Graham's bound for list scheduling."""
+    cluster = importlib.import_module("cluster")
+    stages: list[Any] = []
+    for k, (_, above) in enumerate(drawn):
+        stages.append(
+            SimpleNamespace(name=str(k), upstream=tuple(stages[other] for other in sorted(above) if other < k))
+        )
+    lasts = {str(k): seconds for k, (seconds, _) in enumerate(drawn)}
+    path: dict[str, float] = {}
+    for stage in stages:
+        path[stage.name] = lasts[stage.name] + max((path[other.name] for other in stage.upstream), default=0.0)
+    end, work = cluster.simulate(stages, lasts, cores, 0.0, math.inf, 0)
+    assert work == pytest.approx(sum(lasts.values()))
+    assert end >= max(max(path.values()), work / cores) - 1e-6
+    assert end <= work / cores + (1 - 1 / cores) * max(path.values()) + 1e-6

@@ -61,3 +61,20 @@ def test_on_a_terminal_a_bar_shows_the_metric(
     assert "policy [rom]" in shown
     assert "3/10" in shown
     assert "success 5 %" in shown
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_a_narrow_terminal_shows_which_arm_runs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", str(width))
+    metric = "success 51% (same 62%, cross 40%), a long tale of many more numbers"
+    with bar("policy uniform-nocap, seed 0") as report:
+        report(1_572_864, 50_331_648, metric)
+    assert "policy uniform-nocap, seed 0" in capsys.readouterr().err
+    with progress.lines(["a"]) as show:
+        show("a", f"policy uniform-nocap, seed 0  {metric}  {metric}")
+    shown = capsys.readouterr().err
+    assert "policy uniform-nocap, seed 0" in shown
+    assert all(len(line) <= 3 * width for line in shown.splitlines())

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
+import io
 import shlex
+import signal
 import sys
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from romnav import __version__
+from romnav import __version__, stopping
 from romnav.cli.options import AtScale, ResultsOption, ScaleOption
 from romnav.errors import RomnavError
 
 
 class _Program(TyperGroup):
-    """Turns a user's mistake into one line, and Ctrl-C into how to go on."""
+    """Turns a user's mistake into one line, and a signal into how to go on."""
 
     def invoke(self, ctx: Any) -> Any:
+        stopping.end_with_parent()
         try:
-            return super().invoke(ctx)
+            with stopping.at_once():
+                return super().invoke(ctx)
         except RomnavError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stopped:
+            number = stopped.number if isinstance(stopped, stopping.Stopped) else signal.SIGINT
             again = shlex.join(["romnav", *(word for word in sys.argv[1:] if word != "--no-resume")])
             typer.echo(f"\nstopped; what is done is kept, go on with: {again}", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(128 + number) from None
 
 
 app = typer.Typer(
@@ -66,4 +71,7 @@ def _before_the_command(
 
 def main() -> None:
     """Entry point of ``romnav``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # where a terminal has no dash, it shows a question mark
     app()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from romnav.cli.app import describe
-from romnav.cli.options import AtScale, command, experiments, scales
+from romnav.cli.options import AtScale, OutOption, command, experiments, scales
 from romnav.cli.printing import print_table
 
 SAMPLER_COLUMNS = {
@@ -31,7 +30,7 @@ def world(
         str, typer.Option(help="Experiment whose samplers draw the goals.", autocompletion=experiments)
     ] = "spawn-goal",
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, for scripts.")] = False,
-    out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
+    out: OutOption = None,
 ) -> None:
     """Tell how far and how high the goals of the training terrain lie, and draw it; the terrain is built if need be."""
     from romnav.experiment.describe import describe_world

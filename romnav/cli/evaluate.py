@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,9 @@ from romnav.cli.app import app
 from romnav.cli.options import AtScale, DeviceJob, SeedOption, arms, command
 from romnav.cli.printing import print_table
 from romnav.errors import RomnavError
+
+if TYPE_CHECKING:
+    from romnav.experiment.graph.stage import Stage
 
 KEPT_COLUMNS = {
     "arm": "arm",
@@ -55,30 +58,40 @@ NAVIGATION_COLUMNS = {
     "sr_45": "SR@45",
     "sr_120": "SR@120",
 }
-CONTRAST_COLUMNS = {
-    "a": "a",
-    "b": "b",
-    "horizon": "s",
-    "level": "level",
-    "diff": "diff",
-    "lo": "lo",
-    "hi": "hi",
-    "n": "n",
+CONTRAST_COLUMNS = {"arms": "arms", "horizon": "s", "level": "level", "diff": "diff", "interval": "95 %"}
+VERBOSE_COLUMNS = {
+    **{"arms": "arms", "horizon": "s", "level": "level", "by_tile": "95 %, by tile"},
+    **{"only": "only one", "mid_p": "McNemar p"},
 }
+AllPairsOption = Annotated[
+    bool, typer.Option("--all-pairs", help="Compare every two arms, not only each with the reference arm.")
+]
+VerboseOption = Annotated[
+    bool,
+    typer.Option(
+        "--verbose",
+        help="Of each difference: its interval over tiles, episodes that only one arm solves, McNemar's mid-p.",
+    ),
+]
 
 
 @command(app, "eval")
 def evaluate(
     job: DeviceJob,
     names: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
-            metavar="ARMS...",
-            help="Trained arms, the scripted ones (oracle, straight), or locomotion for its terrain test.",
+            metavar="[ARMS]...",
+            help="Trained arms, the scripted ones (oracle, straight), or locomotion for its terrain test; "
+            "with --paired none is every trained arm.",
             autocompletion=arms,
         ),
-    ],
-    paired: Annotated[bool, typer.Option("--paired", help="Compare the arms episode by episode.")] = False,
+    ] = None,
+    paired: Annotated[
+        bool, typer.Option("--paired", help="Compare the arms episode by episode, each with the first one.")
+    ] = False,
+    all_pairs: AllPairsOption = False,
+    verbose: VerboseOption = False,
     along: Annotated[
         bool, typer.Option("--kept", help="Judge what an arm's run has kept on the way, on the episodes for choices.")
     ] = False,
@@ -90,8 +103,12 @@ def evaluate(
 ) -> None:
     """Evaluate arms on the episode set that all arms share, or the locomotion policy on its tests."""
     from romnav.experiment.graph.run import require
-    from romnav.experiment.kinds.episodes import episodes
 
+    names, paired = names or [], paired or all_pairs or verbose
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise RomnavError(f"{twice} is named twice; name each arm once")
+    if not names and (along or not paired):
+        raise RomnavError("name arms, or compare all that are trained by `romnav eval --paired`; see `romnav list`")
     if along:
         _judge_kept(job, names, seed)
         return
@@ -102,25 +119,53 @@ def evaluate(
         names = [name for name in names if name != "locomotion"]
         if not names:
             return
-    stages = [episodes(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+    if paired and len(names) == 1:
+        raise RomnavError(f"--paired compares arms: name one beside {names[0]}, or none for all that are trained")
+    stages = _of_arms(job, names, seed) if names else _of_trained_arms(job, seed)
     for stage in stages:
         driver = job.project.driver(str(stage.arm))
         for policy in (above for above in stage.upstream if (above.kind, above.arm) == ("policy", driver)):
             require(policy, stage)
     job.make(stages)
-    _print_results(_collect(job), names, paired)
+    collected = _collect(job)
+    chosen = names or [run["arm"] for run in collected["arms"]]
+    pairs = [(names[0], other) for other in names[1:]] if names else job.project.comparisons(chosen)
+    _print_results(collected, chosen, _pairs(chosen, pairs, all_pairs) if paired else [], verbose)
+
+
+def _of_arms(job: DeviceJob, names: list[str], seed: int | None) -> list[Stage]:
+    from romnav.experiment.kinds.episodes import episodes
+
+    return [episodes(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+
+
+def _of_trained_arms(job: DeviceJob, seed: int | None) -> list[Stage]:
+    from romnav.experiment.kinds.episodes import of_trained_arms
+
+    found, left_out = of_trained_arms(job.work)
+    for reason in left_out:
+        typer.echo(f"left out: {reason}", err=True)
+    stages = [stage for stage in found if seed is None or stage.seed == seed]
+    if not stages:
+        scale = job.work.scale
+        raise RomnavError(f"{job.work.folder}: no arm is trained; run `romnav run ablation spawn-goal --scale {scale}`")
+    return stages
 
 
 @command(app, "results")
 def results(
-    at: AtScale, as_json: Annotated[bool, typer.Option("--json", help="As JSON, for scripts.")] = False
+    at: AtScale,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON, for scripts; every two arms, both ways.")] = False,
+    all_pairs: AllPairsOption = False,
+    verbose: VerboseOption = False,
 ) -> None:
-    """Print every evaluated arm and every paired contrast of a scale."""
+    """Print every evaluated arm of a scale, and its paired difference to its experiment's reference arm."""
     collected = _collect(at)
     if as_json:
         typer.echo(json.dumps(collected, indent=2))
-    else:
-        _print_results(collected, [], contrasts=True)
+        return
+    arms = list(dict.fromkeys(run["arm"] for run in collected["arms"]))
+    _print_results(collected, arms, _pairs(arms, at.project.comparisons(arms), all_pairs), verbose)
 
 
 @command(app, "check")
@@ -181,13 +226,29 @@ def _collect(at: AtScale) -> dict[str, Any]:
     return collect(at.project.results, at.work.scale)
 
 
-def _print_results(collected: dict[str, Any], arms: list[str], contrasts: bool) -> None:
-    """Prints metrics (percent, s) and contrasts (percentage points), of ``arms`` only unless empty."""
-    chosen = [run for run in collected["arms"] if not arms or run["arm"] in arms]
-    print_table("Success rates in percent", chosen, RESULT_COLUMNS)
-    if contrasts:
-        order = list(dict.fromkeys(run["arm"] for run in chosen))
-        pairs = list(itertools.combinations(order, 2))
-        rows = [c for pair in pairs for c in collected["contrasts"] if (c["a"], c["b"]) == pair]
-        print_table("Paired differences a - b in percentage points, 95 % intervals", rows, CONTRAST_COLUMNS)
+def _pairs(arms: list[str], compared: list[tuple[str, str]], all_pairs: bool) -> list[tuple[str, str]]:
+    return list(itertools.combinations(dict.fromkeys(arms), 2)) if all_pairs else compared
+
+
+def _print_results(collected: dict[str, Any], arms: list[str], pairs: list[tuple[str, str]], verbose: bool) -> None:
+    """Prints metrics (percent, s) of arms and contrasts (percentage points) of pairs of them."""
+    print_table("Success rates in percent", [run for run in collected["arms"] if run["arm"] in arms], RESULT_COLUMNS)
+    rows = [_words(c) for pair in pairs for c in collected["contrasts"] if (c["a"], c["b"]) == pair]
+    print_table("Paired differences in percentage points", rows, CONTRAST_COLUMNS)
+    if verbose:
+        print_table("How sure they are, and how many episodes only one arm solves", rows, VERBOSE_COLUMNS)
     typer.echo(f"scale {collected['scale']}, episode set {collected['episode_set']}")
+
+
+def _words(contrast: dict[str, Any]) -> dict[str, Any]:
+    def interval(lo: float | None, hi: float | None) -> str | None:
+        return None if lo is None or hi is None else f"{lo:+.1f} to {hi:+.1f}"
+
+    only = None if contrast["a_only"] is None else f"{contrast['a_only']} : {contrast['b_only']}"
+    return contrast | {
+        "arms": f"{contrast['a']} - {contrast['b']}",
+        "diff": None if contrast["diff"] is None else f"{contrast['diff']:+.1f}",
+        "interval": interval(contrast["lo"], contrast["hi"]),
+        "by_tile": interval(contrast["tile_lo"], contrast["tile_hi"]),
+        "only": only,
+    }

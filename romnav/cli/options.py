@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+import re
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
+
+from romnav.errors import RomnavError
 
 if TYPE_CHECKING:
     from romnav.experiment.graph.stage import Session, Stage
@@ -51,9 +55,28 @@ ScaleOption = Annotated[
         "--scale", help="smoke (minutes), cpu (hours) or paper (the paper's numbers, GPU).", autocompletion=scales
     ),
 ]
-SeedOption = Annotated[int | None, typer.Option("--seed", help="Training seed; default: those of the experiment.")]
+LARGEST_SEED = 2**32 - 1
+SeedOption = Annotated[
+    int | None,
+    typer.Option("--seed", min=0, max=LARGEST_SEED, help="Training seed; default: those of the experiment."),
+]
 ExperimentArgument = Annotated[
     str, typer.Argument(help="A file under experiments/, see `romnav list`.", autocompletion=experiments)
+]
+PICTURES = (".png", ".pdf", ".svg")
+
+
+def _picture(path: Path | None) -> Path | None:
+    if path and path.suffix.lower() not in PICTURES:
+        raise RomnavError(f"{path}: key --out names no picture; end it with {', '.join(PICTURES)}")
+    if path and path.is_dir():
+        raise RomnavError(f"{path}: key --out is a folder; name a file in it")
+    return path
+
+
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", callback=_picture, help="Picture to write; default: in results/<scale>/figures/."),
 ]
 ArmArgument = Annotated[str, typer.Argument(help="An arm of an experiment, see `romnav list`.", autocompletion=arms)]
 
@@ -113,6 +136,7 @@ class Job(AtScale):
         stages = run.pending(targets, repeated)
         if not stages:
             _say("nothing to do: everything is finished and up to date")
+        run.prepare(stages)
         execute = self._engine()
         if not execute:
             execute = launch.execute_side_by_side if side_by_side and self.device == "cpu" else run.execute
@@ -173,6 +197,24 @@ class RunJob(DeviceJob):
             typer.echo(line)
 
 
+def _completed(message: str, given: Mapping[str, Any]) -> str:
+    """A message whose commands, in backquotes, are those of the present scale, results and seed.
+
+    Whoever raised it may know of none of them.
+    """
+
+    def complete(hint: re.Match[str]) -> str:
+        words = hint[1]
+        for option in ("scale", "results", "seed"):
+            value, known = given.get(option), words.split()
+            of_seeds = known[1:3] == ["train", "policy"] or known[1] in ("run", "eval")
+            if value not in (None, "smoke") and f"--{option}" not in known and (option != "seed" or of_seeds):
+                words += f" --{option} {shlex.quote(str(value))}"
+        return f"`{words}`"
+
+    return re.sub(r"`(romnav (?:run|train|eval|tables|play|results) [^`]*)`", complete, message)
+
+
 def command(group: typer.Typer, name: str, **settings: Any) -> Callable[[Function], Function]:
     """Registers a function as a command of a group.
 
@@ -197,7 +239,11 @@ def command(group: typer.Typer, name: str, **settings: Any) -> Callable[[Functio
             for option in given:
                 if (source := ctx.get_parameter_source(option)) and source.name == "DEFAULT":
                     given[option] = getattr(ctx.obj, option, given[option])
-            function(options(**given), **values)
+            try:
+                function(options(**given), **values)
+            except RomnavError as error:
+                told = {**given, "seed": values.get("seed")}
+                raise type(error)(_completed(str(error), told)) from error
 
         context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
         own = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own]

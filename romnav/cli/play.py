@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from romnav.cli.app import play
-from romnav.cli.options import ArmArgument, AtScale, command
+from romnav.cli.options import LARGEST_SEED, ArmArgument, AtScale, OutOption, command
 
 
 @command(play, "world")
 def world(
     at: AtScale,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the generator.")] = 0,
-    tile: Annotated[int, typer.Option(min=0, help="Which tile of that seed; the classes take turns.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the generator.")] = 0,
+    tile: Annotated[int, typer.Option(min=0, max=2**16, help="Which tile of that seed; the classes take turns.")] = 0,
+    out: OutOption = None,
 ) -> None:
     """Draw a tile of the terrain in 3D beside its occupancy grids."""
     from romnav.report.pictures import draw_tile
@@ -50,9 +49,9 @@ def episodes(
             help='Which, e.g. \'level == "cross" and climb > 3 and how == "pressed"\'; see the columns printed.'
         ),
     ] = None,
-    count: Annotated[int, typer.Option(min=1, help="How many to draw at most.")] = 6,
-    seed: Annotated[int, typer.Option("--seed", help="Training seed.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="PNG to write; default: results/<scale>/figures/.")] = None,
+    count: Annotated[int, typer.Option(min=1, max=100, help="How many to draw at most.")] = 6,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Training seed.")] = 0,
+    out: OutOption = None,
 ) -> None:
     """Draw maps of an arm's episodes: the way it went beside the shortest, on every layer; and count how it fails."""
     from romnav.experiment.kinds.episodes import look_at

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-TEXT = ("arm", "a", "b", "level")
+TEXT = ("arm", "arms", "level")
 """Headings of columns that are flush left."""
 
 

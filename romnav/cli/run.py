@@ -43,19 +43,20 @@ def _register_trials(kind: str, purpose: str) -> None:
     ) -> None:
         from romnav.experiment.spec import suggest
 
-        (report,) = _reports(job.work, kind, name, seed)
-        known = {str(stage.arm) for stage in report.upstream}
+        reports = [report for report in _reports(job.work, kind, name, seed) if report.kind == "report"]
+        known = {str(stage.arm) for stage in reports[0].upstream}
         for one in arm or ():
             if one not in known:
                 raise RomnavError(f"{job.project.file(name)}: no arm {one}{suggest(one, known)}")
-        driven = [stage for stage in report.upstream if not arm or stage.arm in arm]
+        driven = [stage for stage in reports[0].upstream if not arm or stage.arm in arm]
         if job.listed:
             words = (word for one in arm or () for word in ("--arm", one))
             job.tell(driven, driven, "run", kind, name, *words, *_seed(seed))
             return
         job.make(driven)
-        job.draw([report])
-        _print_tables(report)
+        job.draw(reports)
+        for report in reports:
+            _print_tables(report)
 
 
 _register_trials("safety", "Drive every arm through the three obstacle sets")
@@ -81,6 +82,8 @@ def tables(
         else:
             drawn.append(stage)
             _print_tables(stage)
+    for fault in job.project.faults.values() if name is None else ():
+        raise fault
     if missing and not drawn:
         raise missing[0]
 

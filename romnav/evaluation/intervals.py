@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
+
+from romnav.threads import cores
 
 _BLOCK = 128  # resamples at a time: their counts stay in the cache
 
@@ -34,7 +35,7 @@ def resampled_sums(values: NDArray, resamples: int, seed: int = 0) -> NDArray:
         counts = np.bincount((drawn + offsets).ravel(), minlength=_BLOCK * n).reshape(_BLOCK, n)
         return flat @ counts.T.astype(np.float32)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         sums = np.concatenate(list(pool.map(block, range(-(-resamples // _BLOCK)))), axis=1)
     return sums[:, :resamples].reshape(*values.shape[:-1], resamples).astype(float)
 

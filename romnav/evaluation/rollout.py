@@ -45,6 +45,7 @@ class View:
         start = episodes.start(device)
         count = len(episodes)
         self.env = env
+        self.world = world
         self.episode = torch.arange(count, device=device)
         self.noise = self.episode
         """(A,) names the sensor noise of each row."""

@@ -7,7 +7,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from romnav.config import Config
+from romnav.config import Config, Count, Name, Positive, Seed, Threads
 from romnav.robot.spec import BodySpec
 from romnav.safety.spec import SafetySpec
 from romnav.sensing.spec import CorruptionSpec, LidarSpec
@@ -19,13 +19,13 @@ class EpisodeSetSpec(Config):
 
     world: WorldSpec = WorldSpec(tiles=64, seed=3000, goals_per_tile=32)
     """Evaluation terrain, of another seed than training (P)."""
-    episodes: int = 1024
+    episodes: Count = 1024
     """Initial conditions, shared by all arms (P)."""
     cross: int = 488
     """Of them across levels (P, derived: the paper's contrasts and totals fit no other share)."""
     sampler: SamplerSpec = SamplerSpec(stair_probability=0.0)
     """Spawns uniform over free cells off stairs and mouths, where a humanoid can stand; goals as in training (A)."""
-    seed: int = Field(default=3000, ge=0)
+    seed: Seed = 3000
     """Seed of the draw."""
 
     @model_validator(mode="after")
@@ -38,28 +38,28 @@ class EpisodeSetSpec(Config):
 class EvaluationSpec(Config):
     """Evaluation of one arm."""
 
-    episodes: str = "paired-2"
+    episodes: Name = "paired-2"
     """Episode set, a file under experiments/episodes/."""
-    duration: float = 120.0
+    duration: Positive = 120.0
     """Longest episode, s (P); success within 45 s is read off the same episode."""
-    reach: float = 0.5
+    reach: Positive = 0.5
     """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""
-    threads: int = 1
+    threads: Threads = 1
     """PyTorch threads (A: another number gives other bits)."""
 
 
 class TrialSpec(Config):
     """Trials of one arm in scenes, with the safety filter off and on."""
 
-    trials: int = Field(default=256, ge=1)
+    trials: Count = 256
     """Starts and goals in each scene, shared by all arms (A: an interval of a few percent)."""
-    duration: float = Field(default=60.0, gt=0.0)
+    duration: Positive = 60.0
     """Longest trial, s (A: several times what the paper's trials took)."""
-    reach: float = 0.5
+    reach: Positive = 0.5
     """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""
-    heading: float = Field(default=math.pi / 4, ge=0.0)
+    heading: float = Field(default=math.pi / 4, ge=0.0, le=math.pi)
     """Largest angle at the start between heading and shortest path, rad (A)."""
-    seed: int = Field(default=1000, ge=0)
+    seed: Seed = 1000
     """Seed of starts, goals and sensor noise."""
     body: BodySpec = BodySpec()
     """Of arms on the reduced-order model; those on the humanoid have its own."""
@@ -68,14 +68,14 @@ class TrialSpec(Config):
     """What the filter sees, at the paper's resolution whatever the policy's; the mount is the robot's."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the filter's range images (A: as to the policy's)."""
-    threads: int = 1
+    threads: Threads = 1
     """PyTorch threads (A: another number gives other bits)."""
 
 
 class DeploymentSpec(TrialSpec):
     """Trials in the deployments."""
 
-    trials: int = Field(default=64, ge=1)
+    trials: Count = 64
     """Starts in each deployment, shared by all arms (A)."""
-    duration: float = Field(default=240.0, gt=0.0)
+    duration: Positive = 240.0
     """Longest trial, s (A: at half of the top speed, 100 m take 200 s)."""

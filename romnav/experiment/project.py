@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from romnav import parts
 from romnav.errors import RomnavError
-from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, suggest
+from romnav.experiment.spec import SCRIPTED, Experiment, load_experiments, parse, read_toml, suggest
+from romnav.report.spec import PAIRED, Published
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Project:
         folder = Path.cwd()
         for root in (folder, *folder.parents):
             if (root / "experiments" / "scales").is_dir():
+                parts.search(root)
                 return cls(root, results or root / "results")
         raise RomnavError(f"{folder}: no experiments/ here or above; change to a copy of the romnav repository")
 
@@ -38,16 +42,27 @@ class Project:
         return self.root / ".cache" / "worlds"
 
     @cached_property
-    def experiments(self) -> dict[str, Experiment]:
-        """Experiments by name."""
+    def _read(self) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
         return load_experiments(self.root / "experiments")
+
+    @property
+    def experiments(self) -> dict[str, Experiment]:
+        """Valid experiments by name."""
+        return self._read[0]
+
+    @property
+    def faults(self) -> dict[str, RomnavError]:
+        """What is wrong with the others, by name."""
+        return self._read[1]
 
     def experiment(self, name: str) -> Experiment:
         """One experiment.
 
         Raises:
-            RomnavError: There is none of this name.
+            RomnavError: There is none of this name, or it is invalid.
         """
+        if name in self.faults:
+            raise self.faults[name]
         if name not in self.experiments:
             raise RomnavError(f"unknown experiment {name}{suggest(name, self.experiments)}")
         return self.experiments[name]
@@ -55,6 +70,30 @@ class Project:
     def file(self, experiment: str) -> Path:
         """The file of an experiment."""
         return self.root / "experiments" / f"{experiment}.toml"
+
+    def published_files(self, experiment: str) -> tuple[Path, ...]:
+        """The file of results that an experiment prints beside ours, if it names one.
+
+        Raises:
+            RomnavError: There is no such file.
+        """
+        name = self.experiment(experiment).published
+        if name is None:
+            return ()
+        path = self.root / "experiments" / "published" / f"{name}.toml"
+        if not path.exists():
+            known = (file.stem for file in path.parent.glob("*.toml"))
+            raise RomnavError(f"{self.file(experiment)}: published: no {path.name}{suggest(name, known)}")
+        return (path,)
+
+    def published(self, experiment: str) -> Published | None:
+        """The results that an experiment prints beside ours.
+
+        Raises:
+            RomnavError: There is no such file, or it is invalid.
+        """
+        read = [parse(Published, read_toml(path), path) for path in self.published_files(experiment)]
+        return read[0] if read else None
 
     @property
     def arms(self) -> set[str]:
@@ -65,11 +104,15 @@ class Project:
         """An experiment that has a trained arm.
 
         Raises:
-            RomnavError: None has it.
+            RomnavError: None has it; if one is invalid, it may.
         """
         for name, experiment in self.experiments.items():
             if arm in experiment.arms:
                 return name, experiment
+        if arm in SCRIPTED:
+            raise RomnavError(f"arm {arm} is a script: there is nothing to train; drive it by `romnav eval {arm}`")
+        for fault in self.faults.values():
+            raise fault
         raise RomnavError(f"unknown arm {arm}{suggest(arm, self.arms)}")
 
     def driver(self, arm: str) -> str:
@@ -80,9 +123,28 @@ class Project:
         """
         return arm if arm in SCRIPTED else self.having(arm)[1].driver(arm)
 
+    def script(self, arm: str) -> str | None:
+        """The scripted driver of an arm that has one in place of a policy.
+
+        Raises:
+            RomnavError: There is no such arm.
+        """
+        driver = self.driver(arm)
+        return driver if driver in SCRIPTED else self.having(driver)[1].arms[driver].driver
+
     def seeds(self, arm: str) -> tuple[int, ...]:
         """Training seeds of an arm; a scripted one has only seed 0."""
-        return (0,) if self.driver(arm) in SCRIPTED else self.having(arm)[1].seeds
+        return (0,) if self.script(arm) else self.having(arm)[1].seeds
+
+    def comparisons(self, arms: Collection[str]) -> list[tuple[str, str]]:
+        """Pairs of some arms: those of each experiment with its reference, or with the first that is among them."""
+        pairs: dict[frozenset[str], tuple[str, str]] = {}
+        for bounds in ((), SCRIPTED):  # below all others
+            for experiment in self.experiments.values():
+                found = [arm for arm in (experiment.compared_with, *experiment.arms) if arm in arms]
+                for other in (arm for arm in (*found[1:], *bounds) if found and arm in arms and arm != found[0]):
+                    pairs.setdefault(frozenset((found[0], other)), (found[0], other))
+        return list(pairs.values())
 
     def overview(self) -> str:
         """Experiments, arms, and the training seeds evaluated at each scale, as text."""
@@ -90,12 +152,13 @@ class Project:
         for name, experiment in self.experiments.items():
             lines.append(f"{name}: {experiment.title} ({experiment.kind})")
             labels = [*((arm, spec.label) for arm, spec in experiment.arms.items())]
-            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.tables]
+            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.declared(name, PAIRED).tables]
             lines += [f"  {arm:<16} {label:<22} {self._evaluated(arm)}".rstrip() for arm, label in labels]
         return "\n".join(lines)
 
     def _evaluated(self, arm: str) -> str:
         found: dict[str, list[int]] = {}
         for file in sorted(self.results.glob(f"*/{arm}/seed-*/episodes.parquet")):
-            found.setdefault(file.parts[-4], []).append(int(file.parts[-2].removeprefix("seed-")))
+            if (seed := file.parts[-2].removeprefix("seed-")).isdecimal():
+                found.setdefault(file.parts[-4], []).append(int(seed))
         return "; ".join(f"{scale}: seed {', '.join(map(str, seeds))}" for scale, seeds in found.items())

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from romnav.config import Config
+from romnav.config import Config, Count, Positive
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
-from romnav.navigation.spec import KickstartSpec, NavigationSpec
+from romnav.navigation.spec import MOST_STEPS, KickstartSpec, NavigationSpec
 from romnav.robot.spec import LocomotionSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
@@ -21,11 +21,11 @@ from romnav.world.spec import WorldSpec
 class ResourcesSpec(Config):
     """What a stage takes of a cluster's machine."""
 
-    cores: int = Field(default=1, ge=1)
+    cores: Count = 1
     """Cores: training runs on one thread."""
-    gpus: float = Field(default=0.0, ge=0.0)
+    gpus: float = Field(default=0.0, ge=0.0, le=64.0)
     """Share of a GPU, with ``--device cuda``."""
-    memory_gb: float = Field(default=3.0, gt=0.0)
+    memory_gb: Positive = 3.0
     """Memory (A: measured on a core, see docs/scale.md; `romnav describe scale` tells the largest parts)."""
 
 
@@ -59,6 +59,23 @@ class Scale(Config):
     resources: ResourcesSpec = ResourcesSpec()
     """Share of a machine that a stage takes on a cluster."""
 
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        env, cell = self.navigation.env, self.world.grid.cell
+        if (way := env.command.forward * env.period) > 2 * cell:
+            raise ValueError(
+                f"navigation.env.period: {way:.2f} m in a step at the fastest command, beyond two cells of {cell} m "
+                "(world.grid.cell): robots would jump over walls; lower it"
+            )
+        for name in ("evaluation", "safety", "deploy"):
+            duration = getattr(self, name).duration
+            if not 1.0 <= duration / env.period <= MOST_STEPS:
+                raise ValueError(
+                    f"{name}.duration: {duration} s in steps of {env.period} s (navigation.env.period); make it 1 to "
+                    f"{MOST_STEPS:,} steps"
+                )
+        return self
+
     def on_body(self, dynamics: str) -> Scale:
         """The same with robots of another body."""
         return self.model_copy(update={"navigation": self.navigation.model_copy(update={"dynamics": dynamics})})
@@ -72,9 +89,10 @@ class ScaleFile:
     """
 
     def __init__(self, folder: Path, name: str) -> None:
-        file = folder / f"{name}.toml"
-        if not file.is_file():
-            raise RomnavError(f"unknown scale {name}{suggest(name, (f.stem for f in folder.glob('*.toml')))}")
+        known = {file.stem: file for file in folder.glob("*.toml")}
+        if name not in known:
+            raise RomnavError(f"unknown scale {name}{suggest(name, known)}")
+        file = known[name]
         self.name = name
         self._data = read_toml(file)
         self.settings = parse(Scale, self._data, file)

@@ -5,17 +5,20 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
-from romnav.config import Config
+from romnav.config import Config, Label, Name, Seed
 from romnav.errors import RomnavError
+from romnav.parts import Kind
+from romnav.report.spec import PAIRED, Entry, TableKind, TableSpec
 
-SCRIPTED = ("oracle", "straight")
-"""Arms that need no training; every ablation is evaluated beside them."""
+SCRIPTED = {"oracle": "Oracle", "straight": "Straight"}
+"""Arms that need no training, and their labels; every ablation is evaluated beside them."""
+DRIVERS = Kind("scripted driver", "romnav.drivers", "romnav.evaluation.rollout:Driver")
 RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
 """Names of other folders beside those of the arms: figures, and one for a kind of stage."""
 
@@ -28,19 +31,34 @@ C = TypeVar("C", bound=Config)
 class Arm(Config, extra="allow"):
     """One arm: its label, and the scale's settings that it changes, e.g. ``navigation.ppo.gamma = 0.99``."""
 
-    label: str
+    label: Label
     """Name in lists."""
     policy: str | None = None
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
+    driver: Annotated[str, DRIVERS] | None = Field(default=None, exclude_if=lambda driver: driver is None)
+    """Scripted driver from outside that it has in place of a policy, e.g. "pkg.mod:Name"."""
 
     @property
     def changes(self) -> dict[str, Any]:
         """Settings that differ from the scale's, nested by section."""
         return self.model_extra or {}
 
+    @property
+    def trained(self) -> bool:
+        """Whether it has a policy of its own."""
+        return not (self.policy or self.driver)
+
 
 TrialKind = Literal["safety", "deploy"]
 """Experiments that drive arms through scenes, with the safety filter off and on."""
+
+
+class Declared(Config):
+    """Tables of an experiment, complete, with what they need of it."""
+
+    title: str
+    labels: dict[str, str]
+    tables: dict[str, TableSpec]
 
 
 class Experiment(Config):
@@ -48,15 +66,18 @@ class Experiment(Config):
 
     kind: Literal["ablation", "safety", "deploy"]
     """What is done with the arms."""
-    title: str
+    title: Label
     """One line for lists."""
-    tables: tuple[str, ...] = ()
-    """Tables to write from the episode rows; without any, the arms are not evaluated."""
-    curves: bool = False
-    """Whether to draw and tabulate success while training, over all training seeds."""
-    seeds: tuple[int, ...] = (0,)
+    tables: dict[Name, TableSpec] = Field(default={})
+    """Tables to write, by the name of their files; without any, the usual ones. What none of them needs is not run:
+    where all are of learning curves, the arms are not evaluated."""
+    reference: str = ""
+    """Arm that the others are compared with; empty is the first."""
+    published: Name | None = None
+    """Results to print beside ours: a file under experiments/published/."""
+    seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """Training seeds of every arm."""
-    arms: dict[str, Arm]
+    arms: dict[Name, Arm] = Field(min_length=1)
     """Arms by the name of their results folder."""
     scales: dict[str, dict[str, Any]] = Field(default={})
     """Settings that all arms change at a scale, e.g. ``scales.paper.navigation.env.envs = 3072``."""
@@ -65,6 +86,39 @@ class Experiment(Config):
     def labels(self) -> dict[str, str]:
         """Label of every arm."""
         return {name: arm.label for name, arm in self.arms.items()}
+
+    @property
+    def compared_with(self) -> str:
+        """The reference arm."""
+        return self.reference or next(iter(self.arms))
+
+    def declared(self, name: str, kinds: Collection[TableKind]) -> Declared:
+        """The tables of some kinds, completed; ``name`` is the experiment's."""
+        if self.kind != "ablation":
+            usual = {name: TableSpec(kind="trials")}
+        else:
+            usual = {name: TableSpec(bounds=_entries(SCRIPTED))}
+            if len(self.arms) > 1:
+                usual[f"{name}-contrasts"] = TableSpec(kind="contrasts", bounds=_entries(SCRIPTED))
+        tables = {n: self._complete(t) for n, t in (self.tables or usual).items() if t.kind in kinds}
+        return Declared(title=self.title, labels=self.labels, tables=tables)
+
+    def _complete(self, table: TableSpec) -> TableSpec:
+        if table.kind not in PAIRED:
+            return table
+        labels = SCRIPTED | self.labels
+        reference = table.reference.arm or self.compared_with
+        others = [arm for arm in self.arms if table.kind != "contrasts" or arm != reference]
+
+        def labelled(entries: Iterable[Entry], **update: Any) -> tuple[Entry, ...]:
+            return tuple(e.model_copy(update={"label": e.label or labels[e.arm], **update}) for e in entries)
+
+        update = {
+            "reference": labelled([table.reference.model_copy(update={"arm": reference})])[0],
+            "rows": tuple(map(labelled, table.rows or (_entries(others),))),
+            "bounds": labelled(table.bounds, competes=False),
+        }
+        return table.model_copy(update=update)
 
     def driver(self, arm: str) -> str:
         """The arm whose policy drives ``arm``."""
@@ -76,36 +130,87 @@ class Experiment(Config):
         if taken := {*arms} & RESERVED:
             raise ValueError(f"{', '.join(sorted(taken))} cannot be the name of a trained arm")
         for name, arm in arms.items():
-            if arm.policy and arm.changes.keys() - {"navigation"} | arm.changes.get("navigation", {}).keys() - BODY:
-                raise ValueError(f"{name} drives the policy of {arm.policy}, so it can only change navigation.dynamics")
+            changed = arm.changes.get("navigation", {})
+            beside = arm.changes.keys() - {"navigation"}
+            if not arm.trained and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
+                what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
+                raise ValueError(f"{name} {what}, so it can only change navigation.dynamics")
+            if arm.policy and arm.driver:
+                raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
 
+    @field_validator("seeds")
+    @classmethod
+    def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
+        if twice := [value for k, value in enumerate(values) if value in values[:k]]:
+            raise ValueError(f"{twice[0]} is there twice; name it once")
+        return values
 
-def load_experiments(folder: Path) -> dict[str, Experiment]:
+    @model_validator(mode="after")
+    def _tables_of_its_arms(self) -> Experiment:
+        known = {*self.arms, *SCRIPTED}
+        if self.reference and self.reference not in known:
+            raise ValueError(f"reference: no arm {self.reference}{suggest(self.reference, known)}")
+        for name, table in self.tables.items():
+            if (table.kind == "trials") != (self.kind != "ablation"):
+                raise ValueError(f"tables.{name}.kind: {table.kind} is no table of an experiment of kind {self.kind}")
+            for arm in (table.reference.arm, *(entry.arm for entry in table.entries)):
+                if arm and arm not in known:
+                    raise ValueError(f"tables.{name}: no arm {arm}{suggest(arm, known)}")
+            if table.kind == "contrasts" and not table.rows and len(self.arms) < 2:
+                raise ValueError(f"tables.{name}: there is one arm; contrasts are of several")
+        return self
+
+
+def _entries(arms: Iterable[str]) -> tuple[Entry, ...]:
+    return tuple(Entry(arm=arm) for arm in arms)
+
+
+def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, RomnavError]]:
     """Reads every ``<folder>/<name>.toml``.
 
-    Raises:
-        RomnavError: A file is invalid, names no scale, or two experiments give one arm different settings.
+    Returns:
+        Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
+        no arm, or gives another arm or table a name of one before it. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
-    experiments = {file.stem: parse(Experiment, read_toml(file), file) for file in sorted(folder.glob("*.toml"))}
-    trained = {*SCRIPTED, *(a for e in experiments.values() for a, arm in e.arms.items() if not arm.policy)}
-    seen: dict[str, tuple[str, Arm]] = {}
-    for name, experiment in experiments.items():
-        for scale in experiment.scales.keys() - known:
-            raise RomnavError(f"{folder / name}.toml: scales: unknown scale {scale}{suggest(scale, known)}")
-        for arm_name, arm in experiment.arms.items():
-            if arm.policy and arm.policy not in trained:
-                raise RomnavError(
-                    f"{folder / name}.toml: arms.{arm_name}.policy: no arm {arm.policy} that is trained"
-                    f"{suggest(arm.policy, trained)}"
-                )
-            first, same = seen.setdefault(arm_name, (name, arm))
-            if (same.changes, experiments[first].scales) != (arm.changes, experiment.scales):
-                raise RomnavError(
-                    f"{folder}: {first}.toml and {name}.toml differ in what arm {arm_name} is; rename one"
-                )
-    return experiments
+    read: dict[str, Experiment] = {}
+    wrong: dict[str, RomnavError] = {}
+    for file in sorted(folder.glob("*.toml")):
+        try:
+            read[file.stem] = parse(Experiment, read_toml(file), file)
+        except RomnavError as error:
+            wrong[file.stem] = error
+    drivers = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
+    whole = not wrong  # an arm that is missed may be in what could not be read
+    experiments: dict[str, Experiment] = {}
+    for name, experiment in read.items():
+        if fault := _fault(name, experiment, experiments, known, drivers if whole else None):
+            wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
+        else:
+            experiments[name] = experiment
+    return experiments, wrong
+
+
+def _fault(
+    name: str, experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
+) -> str | None:
+    """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
+    for scale in experiment.scales.keys() - scales:
+        return f"scales: unknown scale {scale}{suggest(scale, scales)}"
+    every = get_args(TableKind)
+    for table in experiment.declared(name, every).tables:
+        for first, other in before.items():
+            if table in other.declared(first, every).tables:
+                return f"tables.{table}: {first}.toml has a table of this name; rename one"
+    for arm_name, arm in experiment.arms.items():
+        if arm.policy and drivers is not None and arm.policy not in drivers:
+            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
+        for first, other in before.items():
+            same = other.arms.get(arm_name)
+            if same and (same.changes, same.driver, other.scales) != (arm.changes, arm.driver, experiment.scales):
+                return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
+    return None
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -115,7 +220,7 @@ def read_toml(file: Path) -> dict[str, Any]:
         RomnavError: It is missing or no TOML.
     """
     try:
-        return tomllib.loads(file.read_text("utf-8"))
+        return tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
         raise RomnavError(f"{file}: cannot be read ({(error.strerror or str(error)).lower()})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -133,7 +238,7 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
         return model.model_validate_json(json.dumps(data, default=str))
     except ValidationError as invalid:
         error = invalid.errors()[0]
-        key = prefix + ".".join(map(str, error["loc"]))
+        key = (prefix + ".".join(str(part) for part in error["loc"] if part != "[key]")).rstrip(".")
         raise RomnavError(f"{file}: {_explain(model, key, error)}") from invalid
 
 

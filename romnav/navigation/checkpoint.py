@@ -9,6 +9,7 @@ import torch
 from pydantic import ValidationError
 from tensordict import TensorDict
 
+from romnav import parts
 from romnav.errors import RomnavError
 from romnav.navigation.policy import BEARING, NavigationActor
 from romnav.navigation.ppo import make_actor
@@ -45,7 +46,7 @@ def load_actor(
     if has_depth and depth_encoder is None:
         raise RomnavError(f"{path}: the policy sees through a depth camera; drive it on the humanoid that has one")
     try:
-        spec = NavigationSpec.model_validate_json(content["spec"])
+        spec = NavigationSpec.model_validate_json(content["spec"], context=parts.SAVED)
         state = content["actor"]["state_embedding.0.weight"].shape[1] - BEARING
         seen = {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, state)}
         if has_depth and depth_encoder is not None:
@@ -54,7 +55,10 @@ def load_actor(
         if own:
             actor.encoder = copy.deepcopy(encoder)
         actor.load_state_dict(content["actor"])
-    except (RuntimeError, ValidationError) as error:
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RomnavError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}; train the arm again") from error
+    except RuntimeError as error:
         reason = str(error).splitlines()[1].strip()
         raise RomnavError(f"{path}: a policy of another architecture ({reason}); train the arm again") from error
     return actor.to(device).eval()

@@ -84,9 +84,9 @@ class NavigationEnv(VecEnv):
         self._geodesic = torch.zeros(count, device=device)
         self._direction = torch.zeros(count, 2, device=device)
         self._finished = torch.zeros(4, dtype=torch.float64, device=device)
-        self._reward_sums = torch.zeros(8, dtype=torch.float64, device=device)
+        self._reward_sums = torch.zeros(len(weights(spec.reward, 0.0)), dtype=torch.float64, device=device)
         self._reward_steps = 0
-        self._reset(self._env)
+        self.restart(self._env)
         # spread over the episode: environments that all end at once make every rollout a different task
         spread = random.uniform(seed, self._env, 0xA6E)
         self.episode_length_buf = (spread * self.max_episode_length).long()
@@ -155,8 +155,21 @@ class NavigationEnv(VecEnv):
         node = self.world.node_at(d.tile, d.layer, d.position[:, :2])
         return torch.stack([self._cross, (node >= 0) & self._connector[node.clamp(min=0)]], dim=1)
 
+    @property
+    def arrived(self) -> Tensor:
+        """(E,) bool the goal has been reached in this episode."""
+        return self._since_arrival >= 0
+
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
         """Drive all robots for one period; finished ones start anew before they are observed."""
+        reward, fallen, timeout = self.advance(actions)
+        done = timeout | fallen
+        ended = done.nonzero()[:, 0]
+        self.restart(ended)
+        return self.get_observations(), reward, done, {"time_outs": timeout}
+
+    def advance(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Drive all robots for one period: rewards (E,), and whether the episode ended in a fall or was truncated."""
         command = to_command(actions, self.spec.command)
         self.dynamics.step(command)
         self._step += 1
@@ -172,12 +185,8 @@ class NavigationEnv(VecEnv):
         stayed = self._since_arrival * self.spec.period >= self.spec.stay
         stalled = (self._since_best * self.spec.period >= self.spec.patience) & (self._since_arrival < 0)
         timeout = ((self.episode_length_buf >= self.max_episode_length) | stayed | stalled) & ~fallen
-        done = timeout | fallen
-        self._count(done)
-        ended = done.nonzero()[:, 0]
-        if len(ended):
-            self._reset(ended)
-        return self.get_observations(), reward, done, {"time_outs": timeout}
+        self._count(timeout | fallen)
+        return reward, fallen, timeout
 
     def statistics(self) -> Statistics:
         """Statistics of the episodes that finished since the last call."""
@@ -237,7 +246,10 @@ class NavigationEnv(VecEnv):
         same, cross = ended * (~self._cross).double(), ended * self._cross.double()
         self._finished += torch.stack([same.sum(), (same * arrived).sum(), cross.sum(), (cross * arrived).sum()])
 
-    def _reset(self, envs: Tensor) -> None:
+    def restart(self, envs: Tensor) -> None:
+        """Put the robots ``envs`` (K,) at the starts of their next episodes."""
+        if len(envs) == 0:
+            return
         episode = self._episode[envs]
         tile = random.integers(len(self.world.tiles), self.seed, envs, episode, 0x711E)
         self._start(envs, sample(self.world, self.spec.sampler, self.seed, tile, envs, episode))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 import torch
 from tensordict import TensorDict
@@ -21,6 +22,23 @@ ACTIONS = 3
 STATE_SIZE = GOAL_SIZE + ACTIONS
 """Non-visual observation on the reduced-order model; on the humanoid, proprioception follows."""
 PRIVILEGED_SIZE = PATCH * PATCH + 8
+
+
+class Located(Protocol):
+    """What an observation takes of a robot, simulated or not."""
+
+    position: Tensor
+    """(E, 3) m."""
+    yaw: Tensor
+    """(E,) rad."""
+
+    @property
+    def proprioception(self) -> Tensor:
+        """(E, P)."""
+        ...
+
+
+R = TypeVar("R", bound=Located)
 Perceive = Callable[[Dynamics, Tensor], dict[str, Tensor]]
 """(robots, counters (E, 2) naming environment and step) -> tokens or images (E, ...) by sensor."""
 
@@ -60,19 +78,19 @@ def goal_observation(position: Tensor, yaw: Tensor, goal: Tensor, goal_yaw: Tens
 
 
 def observe(
-    robot: Dynamics,
+    robot: R,
     goal: Tensor,
     goal_yaw: Tensor,
     previous: Tensor,
     counters: Tensor,
-    perceive: Perceive,
+    perceive: Callable[[R, Tensor], dict[str, Tensor]],
     d_max: float,
 ) -> TensorDict:
-    """What a policy may know, in training, evaluation and trials alike.
+    """What a policy may know, in training, evaluation, trials and on a robot alike.
 
     Args:
         robot: ``E`` of them.
-        goal: (E, 3) positions, tile frame, m.
+        goal: (E, 3) positions, tile frame or whatever frame the robots are in, m.
         goal_yaw: (E,) headings to arrive with, rad.
         previous: (E, 3) commands of the step before, m/s and rad/s.
         counters: (E, 2) environment and step, which name the sensors' noise.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -135,10 +135,9 @@ class Attention(nn.Module):
         self.state_query = nn.Linear(state, width)
         self.cross_kv = nn.Linear(width, 2 * width)
         self.cross_out = nn.Linear(width, width)
-        self.outputs = (spec.queries + 1) * width
 
     def forward(self, tokens: Tensor, state: Tensor) -> Tensor:
-        """Tokens (B, K, C) and state embedding (B, S) -> (B, `outputs`)."""
+        """Tokens (B, K, C) and state embedding (B, S) -> (B, `PolicySpec.visual`)."""
         x = self.embed(tokens) + self.place
         x = self.norm(x + self.self_out(Attend.apply(self._split(self.self_qkv(x), 3), None).flatten(2)))
         query = torch.cat([self.queries.expand(len(x), -1, -1), self.state_query(state)[:, None]], dim=1)
@@ -155,9 +154,14 @@ class NavigationActor(MLPModel):
     In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts. Of the
     observations it reads as much as those had that it was made for: one for the reduced-order model drives a humanoid,
     too. What a humanoid has in addition, proprioception and depth, comes last in every layer that reads it.
+
+    A network from outside extends this class; one that only reads the tokens in another way sets `reader`.
     """
 
     is_recurrent = True
+    reader: Callable[[int, int, int, PolicySpec], nn.Module] = Attention
+    """Makes, of K, C, S and the spec, what turns tokens (B, K, C) and embedded state (B, S) into features
+    (B, `PolicySpec.visual`)."""
 
     def __init__(
         self,
@@ -170,9 +174,8 @@ class NavigationActor(MLPModel):
     ) -> None:
         tokens, channels = obs["lidar"].shape[1:]
         embedding = 64
-        visual = (spec.queries + 1) * spec.attention
         self.depth = "depth" in obs.keys()  # noqa: SIM118 - a TensorDict iterates over its batch
-        seen = visual + embedding + (obs["depth"][0].numel() if self.depth else 0)
+        seen = spec.visual + embedding + (obs["depth"][0].numel() if self.depth else 0)
         self._latent = spec.recurrent + seen
         super().__init__(
             obs,
@@ -183,7 +186,7 @@ class NavigationActor(MLPModel):
             distribution_cfg={"class_name": "BetaDistribution"},
         )
         self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + BEARING, embedding), nn.ELU())
-        self.attention = Attention(tokens, channels, embedding, spec)
+        self.attention = type(self).reader(tokens, channels, embedding, spec)
         self.core = RecurrentCore(seen, spec.recurrent)
         self.way = nn.Linear(self._latent, 3) if guided else None
         """Guesses where the shortest path leads (`romnav.navigation.guidance`)."""

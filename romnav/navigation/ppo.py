@@ -18,7 +18,7 @@ from torch import Tensor
 from romnav.navigation.guidance import Guidance
 from romnav.navigation.observations import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
-from romnav.navigation.spec import PolicySpec, PPOSpec
+from romnav.navigation.spec import NETWORKS, PolicySpec, PPOSpec
 from romnav.precision import reduced_precision
 from romnav.sensing.encoder import Encoder
 
@@ -173,7 +173,8 @@ P = TypeVar("P", bound=BoundedPPO)
 
 def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> NavigationActor:
     """Policy network for the observations ``obs``; one that is ``guided`` also guesses the way."""
-    return NavigationActor(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
+    network: type[NavigationActor] = NETWORKS.load(policy.network) if policy.network else NavigationActor
+    return network(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
 def make_ppo(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from romnav.navigation.spec import RewardSpec
+from romnav.errors import RomnavError
+from romnav.navigation.spec import REWARDS, RewardSpec
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,22 @@ class Transition:
     """Bodies in contact."""
 
 
+class Term(Protocol):
+    """A reward term from outside."""
+
+    def __call__(self, transition: Transition) -> Tensor:
+        """Its unweighted value (E,)."""
+        ...
+
+
 def terms(t: Transition, spec: RewardSpec, period: float) -> dict[str, Tensor]:
-    """Unweighted value of every term of the table, each (E,)."""
+    """Unweighted value of every term of the table and of those from outside, each (E,).
+
+    Raises:
+        RomnavError: One from outside gives something else.
+    """
     gate = (t.geodesic < spec.gate).to(torch.float32)
-    return {
+    table = {
         "position": gate * (1.0 + torch.exp(-((t.planar / 0.5) ** 2)) + torch.exp(-((t.planar / 0.1) ** 2))),
         "heading": gate * torch.exp(-((t.heading_error / 0.5) ** 2)),
         "height": torch.exp(-((t.height_error / 2.5) ** 2)) + torch.exp(-((t.height_error / 0.5) ** 2)),
@@ -47,6 +62,23 @@ def terms(t: Transition, spec: RewardSpec, period: float) -> dict[str, Tensor]:
         "collision": t.contacts,
         "action_rate": (t.command - t.previous).square().sum(dim=1),
     }
+    return table | {name: _outside(name, t) for name in spec.terms}
+
+
+@cache
+def _load(name: str) -> Term:
+    term: Term = REWARDS.load(name)
+    return term
+
+
+def _outside(name: str, t: Transition) -> Tensor:
+    value = _load(name)(t)
+    if not isinstance(value, Tensor) or value.shape != t.planar.shape:
+        given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        raise RomnavError(
+            f"reward term {name}: gives {given}; it has to give a number for each of {len(t.planar)} robots"
+        )
+    return value.to(torch.float32)
 
 
 def progress(best: Tensor, now: Tensor, full: float, share: float | None = None) -> Tensor:
@@ -64,6 +96,7 @@ def weights(spec: RewardSpec, done: float) -> dict[str, float]:
     table = spec.model_dump()
     named = {name: table[name] for name in TERMS if name != "action_rate"}
     named["action_rate"] = after if done >= spec.action_rate_switch else before
+    named |= spec.terms
     return {name: spec.scale * weight for name, weight in named.items()}
 
 

@@ -2,99 +2,147 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from romnav.config import Config
+from romnav.config import (
+    Config,
+    Count,
+    NonNegative,
+    NonPositive,
+    Number,
+    Positive,
+    Range,
+    Rate,
+    Share,
+    Threads,
+    Width,
+)
+from romnav.parts import Kind
 from romnav.sensing.spec import CorruptionSpec
 from romnav.world.spec import SamplerSpec
+
+REWARDS = Kind("reward term", "romnav.rewards", "romnav.navigation.rewards:Term")
+NETWORKS = Kind("policy network", "romnav.networks", "romnav.navigation.policy:NavigationActor", called=False)
+BODIES = Kind("body", "romnav.bodies", "romnav.robot.dynamics:Dynamics", builtin=("rom", "g1"), called=False)
+MOST_STEPS = 1_000_000
+"""Of an episode."""
+WIDEST_HEAD = 64
+"""Channels of an attention head that a kernel keeps in registers."""
 
 
 class CommandSpec(Config):
     """Velocity limits of the command (paper, Sec. III-D)."""
 
-    forward: float = 1.0
+    forward: Positive = 1.0
     """Fastest forward, m/s (P)."""
-    reverse: float = 0.5
+    reverse: NonNegative = 0.5
     """Fastest backward, m/s (A: the paper names no reverse limit)."""
-    lateral: float = 0.25
+    lateral: NonNegative = 0.25
     """Fastest sideways, m/s (P)."""
-    turn: float = 1.0
+    turn: NonNegative = 1.0
     """Fastest turn, rad/s (P)."""
 
 
 class RewardSpec(Config):
     """Reward terms and weights (paper, Table I)."""
 
-    position: float = 0.2
+    position: NonNegative = 0.2
     """Weight of the planar position term (P)."""
-    heading: float = 0.2
+    heading: NonNegative = 0.2
     """Weight of the heading term (P)."""
-    height: float = 0.2
+    height: NonNegative = 0.2
     """Weight of the height term (P)."""
-    stand: float = 0.2
+    stand: NonNegative = 0.2
     """Weight of standing still (P)."""
-    geodesic_progress: float = 0.1
+    geodesic_progress: NonNegative = 0.1
     """Weight of progress along the geodesic (P)."""
-    height_progress: float = 0.1
+    height_progress: NonNegative = 0.1
     """Weight of progress in height (P)."""
-    collision: float = -1.0
+    collision: NonPositive = -1.0
     """Weight per body in contact (P)."""
-    action_rate: tuple[float, float] = (-0.01, -0.1)
+    action_rate: tuple[NonPositive, NonPositive] = (-0.01, -0.1)
     """Weight of the squared change of the command before and after the switch (P)."""
-    action_rate_switch: float = 0.5
+    action_rate_switch: Share = 0.5
     """Share of the run after which the action-rate weight switches (P: iteration 1000 of 2000)."""
-    gate: float = 2.0
+    gate: NonNegative = 2.0
     """Geodesic distance below which the gated terms pay, m (P)."""
-    progress_speed: float = 0.75
+    progress_speed: Positive = 0.75
     """Planar speed that earns the full geodesic progress, m/s (A: a brisk walk leaves room below the limit)."""
-    climb_speed: float = 0.25
+    climb_speed: Positive = 0.25
     """Vertical speed that earns the full height progress, m/s (A: a flight of stairs at half of the top speed)."""
-    scale: float = 0.2
+    scale: Positive = 0.2
     """Common factor, s (A: the control period, so that returns are integrals over time)."""
+    terms: dict[Annotated[str, REWARDS], Number] = Field(default={}, exclude_if=lambda terms: not terms)
+    """Weights of terms from outside, by "pkg.mod:Name"."""
 
 
 class EnvSpec(Config):
     """Episodes of the navigation task."""
 
-    envs: int = 512
+    envs: int = Field(default=512, ge=1, le=2**20)
     """Parallel environments (P: 4096)."""
-    period: float = 0.2
+    period: Positive = 0.2
     """Control period, s (P: 5 Hz)."""
-    duration: float = 45.0
+    duration: Positive = 45.0
     """Longest episode, s (P)."""
-    stay: float = 45.0
+    stay: NonNegative = 45.0
     """An episode is truncated, not ended, this long after the goal was first reached, s (A: never, as the paper
     rewards standing on the goal; short runs use a few seconds and spend the steps on new goals)."""
-    patience: float = 45.0
+    patience: Positive = 45.0
     """An episode is truncated, not ended, after this long without coming nearer to the goal than ever before, s (A:
     never, as the paper names no such end; progress is measured along the shortest path, so short runs lose little by
     starting over)."""
-    reach: float = 0.5
+    reach: Positive = 0.5
     """Distance that counts as arrival, m (P, of evaluation; A: in 3D, or goals would be reached from other floors)."""
-    max_goal_distance: float = 30.0
+    max_goal_distance: Positive = 30.0
     """d_max of the goal observation, m (A: the geodesic cap, beyond which no goal of training lies)."""
     command: CommandSpec = CommandSpec()
     reward: RewardSpec = RewardSpec()
     sampler: SamplerSpec = SamplerSpec()
 
+    @model_validator(mode="after")
+    def _has_steps(self) -> Self:
+        if not 1.0 <= self.duration / self.period <= MOST_STEPS:
+            raise ValueError(
+                f"duration: {self.duration} s in steps of {self.period} s (period); make it 1 to {MOST_STEPS:,} steps"
+            )
+        return self
+
 
 class PolicySpec(Config):
     """Network (paper, Sec. III-B)."""
 
-    attention: int = 64
+    attention: Width = 64
     """Width of self- and cross-attention (A)."""
-    heads: int = 4
+    heads: Width = 4
     """Attention heads (A)."""
-    queries: int = 4
+    queries: Width = 4
     """Learned queries of the cross-attention; one more comes from the non-visual observation (P)."""
-    recurrent: int = 128
+    recurrent: Width = 128
     """Width of the two-layer GRU (A)."""
-    hidden: int = 128
+    hidden: Width = 128
     """Width of the dense layer before the Beta parameters (A)."""
-    critic: tuple[int, ...] = (128, 128)
+    critic: tuple[Width, ...] = Field(default=(128, 128), min_length=1)
     """Hidden widths of the privileged critic (A)."""
+    network: Annotated[str, NETWORKS] | None = Field(default=None, exclude_if=lambda network: network is None)
+    """Policy network from outside, "pkg.mod:Name"."""
+
+    @property
+    def visual(self) -> int:
+        """Number of features that the network makes of the tokens."""
+        return (self.queries + 1) * self.attention
+
+    @model_validator(mode="after")
+    def _has_equal_heads(self) -> Self:
+        if self.attention % self.heads:
+            raise ValueError(
+                f"attention: {self.attention} channels for {self.heads} heads (heads); use a multiple of them"
+            )
+        if self.attention > WIDEST_HEAD * self.heads:
+            raise ValueError(f"heads: {self.heads} for {self.attention} channels; {WIDEST_HEAD} each are the most")
+        return self
 
 
 class EncoderUseSpec(Config):
@@ -102,7 +150,7 @@ class EncoderUseSpec(Config):
 
     pretrained: bool = True
     """Whether it starts from the pretrained weights (P) or, as the paper's No Pretraining, from random ones."""
-    unfreeze_at: float = Field(default=1.0, ge=0.0, le=1.0)
+    unfreeze_at: Share = 1.0
     """Share of the run after which PPO trains it as well; 1 is never (P: the paper's ablation has 1000 of 2000
     iterations)."""
 
@@ -110,42 +158,42 @@ class EncoderUseSpec(Config):
 class PPOSpec(Config):
     """PPO (Schulman et al., 2017) as rsl-rl implements it."""
 
-    stages: int = 1
+    stages: Count = 1
     """Times `iterations` that a run takes. Single-Stage takes as many as both stages of RoM-Nav together (P: 4000);
     what is a share of `iterations`, the switch of the action rate, stays where it is."""
-    iterations: int = 2000
+    iterations: Count = 2000
     """Iterations of one rollout and one update each (P)."""
-    steps: int = 36
+    steps: Count = 36
     """Steps per environment and iteration (A)."""
-    epochs: int = 5
+    epochs: Count = 5
     """Passes over each rollout (A)."""
-    minibatches: int = 8
+    minibatches: Count = 8
     """Minibatches per pass (P)."""
-    gamma: float = 0.997
+    gamma: Share = 0.997
     """Discount per step (A)."""
-    lam: float = 0.95
+    lam: Share = 0.95
     """Generalised advantage estimation (A)."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Surrogate clip (A)."""
-    entropy: float = 0.003
+    entropy: NonNegative = 0.003
     """Entropy coefficient (A)."""
-    value: float = 1.0
+    value: NonNegative = 1.0
     """Value-loss coefficient (A)."""
-    guidance: float = 0.0
+    guidance: NonNegative = 0.0
     """Coefficient of the loss of guessing where the shortest path leads, and how long it is, from what the policy has
     seen (P: none; A: trains the memory on every step, where reward is rare)."""
-    learning_rate: float = 1e-3
+    learning_rate: Rate = 1e-3
     """Initial learning rate (A)."""
-    learning_rate_range: tuple[float, float] = (1e-4, 1e-2)
+    learning_rate_range: Range[Rate] = (1e-4, 1e-2)
     """Bounds of the adaptive learning rate (A: small batches measure the KL noisily and would drive it to nothing)."""
-    desired_kl: float = 0.01
+    desired_kl: Positive = 0.01
     """Target of the adaptive learning rate (A)."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Positive = 1.0
     """Gradient clip (A)."""
-    keep: int | None = Field(default=None, ge=1)
+    keep: Count | None = None
     """Iterations after which the policy so far is kept beside the run, again and again (A: its success on the `dev`
     episodes shows progress where success while training depends on where the robots are let go)."""
-    threads: int = 1
+    threads: Threads = 1
     """PyTorch threads of the run (A: another number gives other bits; two runs on a thread each do half as much again
     as one run on two)."""
 
@@ -153,9 +201,9 @@ class PPOSpec(Config):
 class Schedule(Config):
     """A number that changes linearly once over a run."""
 
-    start: float
+    start: NonNegative
     """Before."""
-    end: float
+    end: NonNegative
     """After."""
     between: tuple[float, float] = (0.0, 1.0)
     """Shares of the run at which the change begins and is done."""
@@ -190,7 +238,7 @@ class KickstartSpec(Config):
     critic_first: float = Field(default=0.0, ge=0.0, lt=1.0)
     """Share of the run in which only the critic learns (A: none; a critic that knows nothing spoils a policy that was
     given something)."""
-    concentration: float | None = Field(default=None, gt=2.0)
+    concentration: float | None = Field(default=None, gt=2.0, le=1e6)
     """Upper bound on the sum of the teacher's two Beta parameters (A: none; a certain teacher leaves the student no
     exploration)."""
 
@@ -198,8 +246,9 @@ class KickstartSpec(Config):
 class NavigationSpec(Config):
     """Everything that the navigation stage needs beside world, sensors and encoder."""
 
-    dynamics: Literal["rom", "g1"] = "rom"
-    """The body that is driven: the reduced-order model, or the humanoid under its frozen locomotion policy."""
+    dynamics: Annotated[str, BODIES] = "rom"
+    """The body that is driven: the reduced-order model, "g1", the humanoid under its frozen locomotion policy, or one
+    from outside, "pkg.mod:Name"."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""
@@ -207,3 +256,13 @@ class NavigationSpec(Config):
     env: EnvSpec = EnvSpec()
     policy: PolicySpec = PolicySpec()
     ppo: PPOSpec = PPOSpec()
+
+    @model_validator(mode="after")
+    def _has_minibatches(self) -> Self:
+        if self.ppo.minibatches > self.env.envs:
+            raise ValueError(
+                f"ppo.minibatches: {self.ppo.minibatches} of {self.env.envs} environments (env.envs); lower it"
+            )
+        if self.env.envs * self.ppo.steps < 2:
+            raise ValueError("ppo.steps: one step of one environment has no deviation to normalise by; raise it")
+        return self

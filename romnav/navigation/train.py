@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from romnav import files
+from romnav import files, stopping
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
+from romnav.navigation.journal import Journal
 from romnav.navigation.kickstart import KickstartedPPO, Teacher, blank_lesson
 from romnav.navigation.perception import Perception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
@@ -45,11 +46,13 @@ def train(
     resume: bool = True,
     progress: Progress | None = None,
 ) -> Path:
-    """Train one policy on robots that ``body`` makes, and write ``out/policy.pt`` and ``out/curve.csv``.
+    """Train one policy on robots that ``body`` makes, and write ``out/policy.pt`` and ``out/curve.csv``, the latter as
+    TensorBoard's events, too.
 
     Every ``spec.ppo.keep`` iterations the policy so far is kept as ``out/kept/<iteration>.pt``.
     ``out/checkpoint.pt`` holds the whole state of the run every two minutes: a run that is killed and started again
-    ends in the same weights as one left alone. It is deleted at the end.
+    ends in the same weights as one left alone. A signal that ends the program has it written, too, after the iteration
+    at hand.
 
     Args:
         spec: Task, policy and learning.
@@ -107,42 +110,47 @@ def _train(
         done, seconds, curve = saved["iterations"], saved["seconds"], saved["curve"]
         obs = env.get_observations()
     ppo.train_mode()
+    journal = Journal(out, done * spec.env.envs * spec.ppo.steps)
     saved_at = started = time.monotonic()
     before, cpu_before = seconds, curve[-1]["cpu_seconds"] if curve else 0.0
     cpu_started = time.process_time()
     steps = spec.env.envs * spec.ppo.steps
-    while done < total:
-        if done == unfreeze_at:
-            obs = _unfreeze(ppo, env, perception)
-        env.progress = done / spec.ppo.iterations
-        ppo.begin(done / total)
-        with torch.inference_mode():
-            for _ in range(spec.ppo.steps):
-                obs, reward, dones, extras = env.step(ppo.act(obs))
-                ppo.process_env_step(obs, reward, dones, extras)
-            ppo.compute_returns(obs)
-        try:
-            losses = ppo.update()
-        except (RuntimeError, ValueError) as error:
-            # distributions refuse parameters that are not finite, before any loss is reported
-            _check_finite(state, done + 1, {}, ppo)
-            raise error
-        done += 1
-        seconds = before + time.monotonic() - started
-        cpu_seconds = cpu_before + time.process_time() - cpu_started
-        curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate) | ppo.report())
-        _check_finite(state, done, curve[-1], ppo)
-        if progress:
-            progress(done * steps, total * steps, _summary(curve))
-        if spec.ppo.keep and done % spec.ppo.keep == 0:
-            _save_policy(out / "kept" / f"{done:06d}.pt", identity, ppo, done * steps, seconds)
-        if time.monotonic() - saved_at > SAVE_EVERY and done < total:
-            _save(state, identity, ppo, env, done, seconds, curve)
-            saved_at = time.monotonic()
+    with stopping.deferred() as stop:
+        while done < total:
+            if done == unfreeze_at:
+                obs = _unfreeze(ppo, env, perception)
+            env.progress = done / spec.ppo.iterations
+            ppo.begin(done / total)
+            with torch.inference_mode():
+                for _ in range(spec.ppo.steps):
+                    obs, reward, dones, extras = env.step(ppo.act(obs))
+                    ppo.process_env_step(obs, reward, dones, extras)
+                ppo.compute_returns(obs)
+            try:
+                losses = ppo.update()
+            except (RuntimeError, ValueError) as error:
+                # distributions refuse parameters that are not finite, before any loss is reported
+                _check_finite(state, done + 1, {}, ppo)
+                raise error
+            done += 1
+            seconds = before + time.monotonic() - started
+            cpu_seconds = cpu_before + time.process_time() - cpu_started
+            curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate) | ppo.report())
+            _check_finite(state, done, curve[-1], ppo)
+            journal.add(curve[-1])
+            if progress:
+                progress(done * steps, total * steps, _summary(curve))
+            if spec.ppo.keep and done % spec.ppo.keep == 0:
+                _save_policy(out / "kept" / f"{done:06d}.pt", identity, ppo, done * steps, seconds)
+            if stop or (time.monotonic() - saved_at > SAVE_EVERY and done < total):
+                journal.flush()
+                _save(state, identity, ppo, env, done, seconds, curve)
+                saved_at = time.monotonic()
+            stop.obey()
+    journal.close()
     _write_curve(out / "curve.csv", curve)
     policy = out / "policy.pt"
     _save_policy(policy, identity, ppo, total * steps, seconds)
-    state.unlink(missing_ok=True)
     return policy
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.statistics import Estimate
-from romnav.report import paper
-from romnav.report.formats import Block, Cell, Row, Table, number
+from romnav.report.formats import Block, Cell, Row, Table, literal, number
+from romnav.report.spec import Published
 
 SHARE = 0.1
 """Part of the run over which success is averaged: a trailing window in the figure, the last one in the table."""
@@ -130,7 +130,7 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
         shown = np.isfinite(rates).all(axis=0)
         iteration, rates = iteration[shown], rates[:, shown]
         axes.fill_between(iteration, rates.min(axis=0), rates.max(axis=0), color=colour, alpha=0.2, linewidth=0)
-        axes.plot(iteration, rates.mean(axis=0), color=colour, label=curves.label)
+        axes.plot(iteration, rates.mean(axis=0), color=colour, label=literal(curves.label))
         if 0.0 < curves.unfreeze_at < 1.0:
             axes.axvline(round(curves.unfreeze_at * curves.iterations), color=colour, linestyle=":", linewidth=1)
     axes.set(xlabel="iteration", ylabel="success while training (%)", ylim=(0, None), xlim=(0, None))
@@ -142,38 +142,42 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
 
 def tabulate(
     name: str,
-    title: str,
+    caption: str,
     arms: Mapping[str, Curves],
     provenance: dict[str, str],
     sources: Mapping[str, tuple[Mapping[str, Any], ...]],
+    published: Published | None = None,
 ) -> Table:
     """Final success and iteration time of every arm, with what their runs come from; times are relative to the first
     arm's frozen iterations."""
     reference = next(iter(arms.values())).iteration_time(unfrozen=False)
     ours = tuple(Row(curves.label, _cells(curves, reference), sources[arm]) for arm, curves in arms.items())
     dash = number(math.nan, 1)
-    factors = {arms[arm].label: factor for arm, factor in paper.ITERATION_TIME.items() if arm in arms}
-    published = tuple(Row(label, (dash, dash, number(factor, 2))) for label, factor in factors.items())
+    known = {} if published is None else {arm: published.arms.get(arm, {}).get("iteration_time") for arm in arms}
+    theirs = tuple(
+        Row(arms[arm].label, (dash, dash, number(factor, 2))) for arm, factor in known.items() if factor is not None
+    )
     first = next(iter(arms.values()))
     seeds = ", ".join(sorted({str(len(curves.seeds)) for curves in arms.values()}))
     steps = first.seeds[0]["steps"].iloc[-1] / 1e6
     caption = (
-        f"{title}. Success rate while training over the last {SHARE:.0%} of the run, mean over training seeds, with "
+        f"{caption} Success rate while training over the last {SHARE:.0%} of the run, mean over training seeds, with "
         "its two-level 95% bootstrap interval (seeds, and episodes within a seed); median CPU time of an iteration "
         "while PPO trains the encoder, relative to one with a frozen encoder. "
         f"This work: {provenance['scale']} scale, {steps:.3g} M steps, training seeds per arm: {seeds}; "
-        f"commit {provenance['commit']}. Paper: as published, wall-clock time on a GPU."
+        f"commit {provenance['commit']}."
     )
+    blocks = [Block("ours", f"This work, {provenance['scale']} scale", ours)]
+    if published and theirs:
+        caption += f" {published.title}: as published, wall-clock time on a GPU."
+        blocks.append(Block("paper", published.title, theirs))
     return Table(
         name,
         caption,
         (),
         ("Arm", "Success (%)", "95% interval", "Iteration time"),
         ("success", "interval", "iteration_time"),
-        (
-            Block("ours", f"This work, {provenance['scale']} scale", ours),
-            *([Block("paper", "Paper", published)] if published else []),
-        ),
+        tuple(blocks),
         provenance,
     )
 

@@ -46,7 +46,7 @@ def draw_encoder(
     index = torch.arange(CANDIDATES, device=device)
     tile, origin, yaw = Poses([grids for _, grids in tiles], height, 1, device)(index)
     clean, labels = sensor.scan(tile, origin, yaw, labels=True)
-    kinds = np.array([t.kind.value for t, _ in tiles])[tile.cpu().numpy()]
+    kinds = np.array([t.kind for t, _ in tiles])[tile.cpu().numpy()]
     rows = [
         (share, _richest(labels, torch.tensor(kinds == kind, device=device)), kind)
         for kind in sorted(set(kinds))

@@ -32,6 +32,11 @@ def number(value: float, decimals: int, *, sign: bool = False, dagger: bool = Fa
     return Cell(value, text, facts, dagger=dagger)
 
 
+def literal(text: str) -> str:
+    """Text that matplotlib shows as it is: a dollar is no formula."""
+    return text.replace("$", r"\$")
+
+
 @dataclass(frozen=True)
 class Row:
     """A labelled row of numbers, and the files that they are made of with their provenance, for the report."""

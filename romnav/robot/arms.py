@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from romnav.robot.g1 import HEAD, NOTHING, build_spec
+from romnav.robot.g1 import HEAD, build_spec
 from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import NOTHING
 
 LIMIT, STEP = math.radians(12.0), math.radians(3.0)
 """Largest roll and pitch of the torso in the table, and their spacing, rad: a walking torso stays within."""

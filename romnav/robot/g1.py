@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import importlib.resources
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import Protocol
 
 import mujoco
 import mujoco.batch
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import CUBE, FIELDS, OBSTACLES, VOLUMES, Geoms, Slots
+from romnav.threads import cores
 
 SIDES = ("left", "right")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -29,38 +32,17 @@ FOOT_LENGTH, FOOT_WIDTH = 0.185, 0.07
 """Size of the sole, m."""
 HEAD = (0.0003, 0.0, 0.4284)
 """Sensors in the frame of the torso, m (Unitree's URDF: `torso_link` to `mid360_link`)."""
-OBSTACLES = "obstacles"
-"""Body of the ground that feet should not touch."""
 _SOLE_RADIUS = 0.01
 _BEGIN = 1.0
 """Time of a robot that is placed, s: one that MuJoCo had to reset is at 0."""
 
 
-class Statics(Protocol):
-    """What stands on the plane z = 0."""
+class Ground(Protocol):
+    """What stands on the plane z = 0: geoms, or slots for them."""
 
     def add_to(self, model: mujoco.MjSpec) -> None:
         """Add collision geoms: what is walked on to the world body, what is in the way to the body `OBSTACLES`."""
         ...
-
-
-class Boxes(NamedTuple):
-    """Static boxes of the ground: centres (n, 3), half sizes (n, 3), both m, and orientations (n, 4), wxyz."""
-
-    centre: NDArray[np.float64]
-    half: NDArray[np.float64]
-    quat: NDArray[np.float64]
-
-    def add_to(self, model: mujoco.MjSpec) -> None:
-        """Add them to the world body."""
-        for centre, half, quat in zip(*self, strict=True):
-            model.worldbody.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=half, quat=quat, contype=1, conaffinity=1
-            )
-
-
-NOTHING = Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
-"""Flat ground."""
 
 
 def _asset(name: str) -> str:
@@ -114,12 +96,12 @@ def _collide_with_ground(spec: mujoco.MjSpec, friction: float) -> None:
             spec.add_pair(geomname1=f"left_{a}", geomname2=f"right_{b}", condim=1)
 
 
-def build_spec(spec: RobotSpec, ground: Statics, *, visual: bool = False) -> mujoco.MjSpec:
+def build_spec(spec: RobotSpec, ground: Ground, *, visual: bool = False) -> mujoco.MjSpec:
     """G1 and ground as an editable MuJoCo model.
 
     Args:
         spec: gains, friction, welded joints.
-        ground: static geoms; the plane z = 0 is always there.
+        ground: geoms or slots; the plane z = 0 is always there.
         visual: keep the meshes (for pictures; the dynamics are the same).
     """
     model = mujoco.MjSpec.from_file(_asset("g1_mjx.xml"))
@@ -190,9 +172,10 @@ def _single(array: NDArray[np.float64]) -> Tensor:
 
 
 class Robots(ABC):
-    """A batch of G1 robots, each alone on the ground, whatever engine moves them. Tensors are float32.
+    """A batch of G1 robots, each alone on one of several grounds, whatever engine moves them. Tensors are float32.
 
     Attributes:
+        ground: (n,) which ground each is on; see `stand_on`.
         pelvis, orientation, velocity, spin: (n, 3) position, (n, 3, 3) rotation, (n, 3) world linear and
             (n, 3) body angular velocity of the pelvis; m, m/s, rad/s.
         joints, joint_velocity: (n, 15), rad, rad/s, in the order of `JOINTS`.
@@ -206,9 +189,14 @@ class Robots(ABC):
         lost: (n,) whether the state stopped being finite since the robot was placed: the engine began anew.
     """
 
-    def __init__(self, spec: RobotSpec, ground: Statics, count: int) -> None:
+    def __init__(self, spec: RobotSpec, grounds: Sequence[Geoms], count: int) -> None:
         self.spec, self.count = spec, count
-        self.model = build_spec(spec, ground).compile()
+        self._slots = Slots(grounds)
+        self.model = build_spec(spec, self._slots).compile()
+        self._slots.attach(self.model)
+        self.ground = torch.zeros(count, dtype=torch.int64)
+        self._within = np.full((count, 4), -1)
+        self._held: dict[str, NDArray] = {}
         self.kp = torch.tensor(self.model.actuator_gainprm[:, 0], dtype=torch.float32)
         self.mass = float(self.model.body_subtreemass[1])
         self.joint_range = torch.tensor(self.model.jnt_range[1:], dtype=torch.float32)
@@ -226,6 +214,26 @@ class Robots(ABC):
         self.touch = torch.zeros(count, len(touch), dtype=torch.bool)
         self.torque = torch.zeros(count, len(JOINTS))
         self.lost = torch.zeros(count, dtype=torch.bool)
+
+    def stand_on(self, ground: Tensor) -> None:
+        """Robots are on grounds (n,) from now on."""
+        self.ground = ground.clone()
+        self._derive()
+
+    def _surround(self, pelvis: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Hold, in the model of every robot with its pelvis at (n, 3), what is within its reach; whose has changed."""
+        # what is not finite is nowhere; it touches nothing until MuJoCo resets it
+        cube = np.floor(np.nan_to_num(pelvis, posinf=0.0, neginf=0.0) / CUBE).clip(-(2**31), 2**31)
+        within = np.column_stack([self.ground.numpy(), cube.astype(np.int64)])
+        moved = (within != self._within).any(1).nonzero()[0]
+        for robot in moved.tolist():
+            self._slots.fill(self._held, robot, int(within[robot, 0]), within[robot, 1:])
+        self._within = within
+        return moved
+
+    @abstractmethod
+    def _derive(self, ids: NDArray | None = None) -> None:
+        """Everything that depends on positions and velocities, of all robots or of `ids` at least."""
 
     @abstractmethod
     def _field(self, name: str) -> Tensor:
@@ -258,27 +266,36 @@ class Robots(ABC):
 
 
 class Humanoids(Robots):
-    """`Robots` stepped by native MuJoCo on all cores, in float64.
+    """`Robots` stepped by native MuJoCo on all cores, in float64. Results do not depend on the number of threads."""
 
-    All stand on the same ground unless `stand_on` gives each its own. Results do not depend on the number of
-    threads.
-    """
+    def __init__(self, spec: RobotSpec, grounds: Sequence[Geoms], count: int, *, threads: int = 0) -> None:
+        super().__init__(spec, grounds, count)
+        self._threads = threads or cores()
+        self._open()
 
-    def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, threads: int = 0) -> None:
-        super().__init__(spec, ground, count)
-        self._models: list[mujoco.MjModel] = []
-        self.batch = mujoco.batch.Batch(self.model, count, threads, persistent=True)
+    def _open(self) -> None:
+        """Begin a batch of `count` robots of the model."""
+        self.batch = mujoco.batch.Batch(self.model, self.count, self._threads, persistent=True)
         for field in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             self.batch.bind(field)
         for field in ("xpos", "xmat", "subtree_com", "xanchor", "xaxis", "sensordata", "actuator_force"):
             self.batch.bind(field)
-        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self._read()
+        self._held = {name: self.batch.expand(name) for name in (*FIELDS, VOLUMES)}
+        self._within = np.full((self.count, 4), -1)
+        self._derive()
 
-    def stand_on(self, models: list[mujoco.MjModel]) -> None:
-        """Give every robot the model it is in from now on, of `build_spec` with as many geoms as this one's."""
-        self.batch.set_models(models)
-        self._models = models
+    def part(self, ids: Tensor) -> Humanoids:
+        """Robots `ids` (k,) alone, in that order, each in its state."""
+        part = copy.copy(self)
+        part.count, part.ground = len(ids), self.ground[ids]
+        part._open()
+        part.load_state_dict({name: value[ids] for name, value in self.state_dict().items()})
+        return part
+
+    def _derive(self, ids: NDArray | None = None) -> None:
+        self._surround(self.batch.qpos[:, :3])
+        self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._read()
 
     def _field(self, name: str) -> Tensor:
         return _single(getattr(self.batch, name))
@@ -293,6 +310,7 @@ class Humanoids(Robots):
         self.batch.ctrl[:] = target.numpy()
         index = None if ids is None else ids.numpy()
         before = self.batch.time.copy()
+        self._surround(self.batch.qpos[:, :3])
         self.batch.step(ids=index, nstep=self.spec.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
         # MuJoCo resets what blows up, the clock too, to a robot that stands at the origin.
         stepped = np.zeros(self.count, bool)
@@ -312,43 +330,25 @@ class Humanoids(Robots):
         self.batch.time[index] = _BEGIN
         self.batch.qpos[index] = qpos.double().numpy()
         self.batch.qvel[index] = qvel.double().numpy()
-        self.batch.forward(ids=index, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.touch[ids] = False
         self.torque[ids] = 0.0
         self.lost[ids] = False
-        self._read()
+        self._derive(index)
 
     def push(self, ids: Tensor, velocity: Tensor) -> None:
         """Add horizontal velocity (k, 2), m/s, to the pelvis of robots `ids`."""
         if len(ids) == 0:
             return
         self.batch.qvel[ids.numpy(), :2] += velocity.double().numpy()
-        self.batch.forward(ids=ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self._read()
+        self._derive(ids.numpy())
 
     def randomize(self, friction: Tensor, payload: Tensor) -> None:
         """Give every robot its own foot friction (n,) and torso payload (n,), kg."""
         soles = [self.model.geom(f"{side}_sole{k}_collision").id for side in SIDES for k in range(6)]
-        if self._models:
-            self.stand_on(
-                [
-                    self._own(model, soles, float(slip), float(load))
-                    for model, slip, load in zip(self._models, friction, payload, strict=True)
-                ]
-            )
-            return
         self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
         torso = self.model.body("torso_link").id
         self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
         self.batch.set_const()
-
-    @staticmethod
-    def _own(model: mujoco.MjModel, soles: list[int], friction: float, payload: float) -> mujoco.MjModel:
-        own = copy.copy(model)
-        own.geom_friction[soles, 0] = friction
-        own.body_mass[own.body("torso_link").id] += payload
-        mujoco.mj_setConst(own, mujoco.MjData(own))
-        return own
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that decides the future: MuJoCo's integration state and the last contacts."""
@@ -361,6 +361,5 @@ class Humanoids(Robots):
         """Continue from `state_dict`."""
         for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time"):
             getattr(self.batch, name)[:] = state[name].numpy()
-        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.touch, self.torque, self.lost = (state[name].clone() for name in ("touch", "torque", "lost"))
-        self._read()
+        self._derive()

@@ -146,7 +146,7 @@ def record(checkpoint: Path, *, per_slope: int = 4, threads: int = 0) -> GaitLib
     n = 2 * per_slope * len(lanes)
     index = torch.arange(n)
     lane, direction = index % len(lanes), torch.where((index // len(lanes)) % 2 == 0, 1, -1)
-    robots = Humanoids(spec.robot, ground.boxes, n, threads=threads)
+    robots = Humanoids(spec.robot, [ground.geoms], n, threads=threads)
     control = Controller(spec, robots)
     start = torch.where(direction > 0, ground.spawn[lane, 0], ground.spawn[lane, 1])
     goal = torch.where(direction > 0, ground.spawn[lane, 1], ground.spawn[lane, 2])
@@ -209,7 +209,7 @@ def still_up(
     if not known:
         raise RomnavError("gait library: empty; record it with a policy that crosses stairs or ramps")
     ground = Ground(lanes)
-    robots = Humanoids(spec.robot, ground.boxes, trials, threads=threads)
+    robots = Humanoids(spec.robot, [ground.geoms], trials, threads=threads)
     control = Controller(spec, robots)
     random = torch.Generator().manual_seed(seed)
     index, lane, start = torch.arange(trials), torch.zeros(trials, dtype=torch.long), torch.zeros(trials)

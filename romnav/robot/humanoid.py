@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,11 +12,11 @@ from torch import Tensor
 from romnav import random
 from romnav.errors import RomnavError
 from romnav.robot.dynamics import Head
-from romnav.robot.g1 import HEAD, Humanoids, build_spec
+from romnav.robot.g1 import HEAD, Humanoids
 from romnav.robot.gaits import Gait, GaitLibrary
 from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
-from romnav.robot.tiles import TileGeoms, TileHeights, change_layer
+from romnav.robot.tiles import TileHeights, change_layer, geoms
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.world import World
@@ -41,7 +40,7 @@ class _Slope(NamedTuple):
 
 
 class Humanoid:
-    """``E`` robots on the tiles of a world, each in a MuJoCo model of its tile; the `Dynamics` of the humanoid stage.
+    """``E`` robots on the tiles of a world, stepped by MuJoCo; the `Dynamics` of the humanoid stage.
 
     A start on a stair or ramp takes a state out of the gait library, walking up or down, whichever is nearer to
     the start's heading; where the library has none, the robot stands on the slope in that heading.
@@ -71,10 +70,8 @@ class Humanoid:
         Raises:
             RomnavError: the checkpoint is missing, or the period is no multiple of the control step.
         """
-        self.world, self.period, self.gaits, self.seed, self.threads = world, period, gaits, seed, threads
+        self.world, self.period, self.gaits, self.seed = world, period, gaits, seed
         self._spec, self._policy, _ = load_policy(checkpoint)
-        self._geoms = TileGeoms.of(world.tiles)
-        self._models: dict[int, mujoco.MjModel] = {}
         self._heights = TileHeights(world.tiles)
         self.tile = torch.zeros(envs, dtype=torch.int64)
         self.layer = torch.zeros(envs, dtype=torch.int64)
@@ -85,22 +82,14 @@ class Humanoid:
         self._env = torch.arange(envs)
         self._resets = torch.zeros(envs, dtype=torch.int64)
         self._first = torch.ones(envs, dtype=torch.bool)
-        self.robots = self._batch(envs)
+        self.robots = Humanoids(self._spec.robot, [geoms(tile.solids) for tile in world.tiles], envs, threads=threads)
         self.control = Controller(self._spec, self.robots)
         self._ticks = round(period / self.control.dt)
         if abs(self._ticks * self.control.dt - period) > 1e-9:
             raise RomnavError(f"period {period} s: no multiple of the control step, {self.control.dt} s")
 
-    def _batch(self, envs: int) -> Humanoids:
-        return Humanoids(self._spec.robot, self._geoms[0], envs, threads=self.threads)
-
-    def _model(self, tile: int) -> mujoco.MjModel:
-        if tile not in self._models:
-            self._models[tile] = build_spec(self._spec.robot, self._geoms[tile]).compile()
-        return self._models[tile]
-
     def _enter_tiles(self) -> None:
-        self.robots.stand_on([self._model(t) for t in self.tile.tolist()])
+        self.robots.stand_on(self.tile)
         self._heights.place(self.tile)
 
     def reset(self, envs: Tensor, start: Start) -> None:
@@ -229,15 +218,11 @@ class Humanoid:
 
     def select(self, envs: Tensor) -> None:
         """Keep only the robots ``envs`` (K,), in that order."""
-        state, walking = self.robots.state_dict(), self.control.snapshot(envs)
+        self.robots = self.robots.part(envs)
+        self.control = self.control.part(envs, self.robots)
         for name in _STATE:
             setattr(self, name, getattr(self, name)[envs])
-        self.robots = self._batch(len(envs))
-        self.control = Controller(self._spec, self.robots)
-        self._enter_tiles()
-        self.control.restore(torch.arange(len(envs)), walking)
-        # After `restore`, which forgets contacts and the solver's warm start.
-        self.robots.load_state_dict({name: value[envs] for name, value in state.items()})
+        self._heights.place(self.tile)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that changes while stepping."""

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from romnav.robot.g1 import OBSTACLES
-from romnav.world.mesh import triangulate
-from romnav.world.solids import Shape, Solids, SolidsBuilder
+from romnav.robot.statics import BOX, CYLINDER, MESH, Geoms
+from romnav.world.solids import Shape, Solids
 from romnav.world.tile import Tile
 from romnav.world.world import World
 
@@ -22,93 +16,38 @@ CELL = 0.025
 """Cell of the height maps, m: a tenth of a tread."""
 NOWHERE = -32768
 """Height, mm, where a layer has no walking surface."""
-_TOUCH = {"contype": 1, "conaffinity": 1}
 
 
-@dataclass(frozen=True)
-class TileGeoms:
-    """The solids of a tile as static geoms, filled up to given numbers with geoms under the ground.
+def geoms(solids: Solids) -> Geoms:
+    """Solids that rise above the ground floor, which is a plane already, as geoms of MuJoCo.
 
-    MuJoCo steps a batch on several models only where their data have one layout, so all tiles of a world get
-    the same number of geoms and of meshes. Upright boxes and cylinders are MuJoCo's own, inclined solids are
-    convex meshes of twelve triangles.
+    Upright boxes and cylinders are MuJoCo's own, inclined solids convex meshes. What is not walkable is an obstacle.
     """
-
-    solids: Solids
-    upright: int
-    inclined: int
-
-    @classmethod
-    def of(cls, tiles: Sequence[Tile]) -> list[TileGeoms]:
-        """Those of several tiles, alike in number."""
-        standing = [_standing(tile.solids) for tile in tiles]
-        inclined = [int(_inclined(solids).sum()) for solids in standing]
-        upright = [len(solids) - n for solids, n in zip(standing, inclined, strict=True)]
-        # one more, so that the body of the obstacles is never empty
-        return [cls(solids, max(upright) + 1, max(inclined)) for solids in standing]
-
-    def add_to(self, model: mujoco.MjSpec) -> None:
-        """Add the geoms: walking surfaces to the world body, obstacles to a body of their own."""
-        tilted = _inclined(self.solids)
-        for index in np.flatnonzero(~tilted):
-            _add_upright(model, self.solids[index : index + 1])
-        for index in np.flatnonzero(tilted):
-            _add_mesh(model, self.solids[index : index + 1])
-        for _ in range(self.upright - int((~tilted).sum())):
-            _add_upright(model, _FILLER)
-        for _ in range(self.inclined - int(tilted.sum())):
-            _add_mesh(model, _FILLER)
+    solids = solids[solids.top + np.abs(solids.slope_top) * solids.half[:, 0] > 1e-6]
+    n, inclined = len(solids), (solids.slope_top != 0) | (solids.slope_bottom != 0)
+    hull = np.full(n, -1)
+    hull[inclined] = np.arange(inclined.sum())
+    zero = np.zeros(n)
+    return Geoms(
+        kind=np.where(inclined, MESH, np.where(solids.shape == Shape.CYLINDER, CYLINDER, BOX)),
+        position=np.column_stack([solids.centre, (solids.top + solids.bottom) / 2]),
+        quat=np.column_stack([np.cos(solids.yaw / 2), zero, zero, np.sin(solids.yaw / 2)]),
+        half=np.column_stack([solids.half, (solids.top - solids.bottom) / 2]),
+        hull=hull,
+        hulls=_corners(solids[inclined]),
+        obstacle=~solids.walkable,
+    )
 
 
-def _filler() -> Solids:
-    builder = SolidsBuilder()
-    builder.box((0.0, 0.0), (0.2, 0.2), (-5.2, -5.0))
-    return builder.build()
-
-
-_FILLER = _filler()
-
-
-def _standing(solids: Solids) -> Solids:
-    """Those that rise above the ground floor, which is a plane already."""
-    return solids[solids.top + np.abs(solids.slope_top) * solids.half[:, 0] > 1e-6]
-
-
-def _inclined(solids: Solids) -> NDArray[np.bool_]:
-    return (solids.slope_top != 0) | (solids.slope_bottom != 0)
-
-
-def add_solid(model: mujoco.MjSpec, solid: Solids) -> Any:
-    """Add one solid: a walking surface to the world body, an obstacle to the body `OBSTACLES`; returns the geom."""
-    return (_add_mesh if _inclined(solid)[0] else _add_upright)(model, solid)
-
-
-def _add_upright(model: mujoco.MjSpec, solid: Solids) -> Any:
-    (x, y), (u, v), yaw = solid.centre[0], solid.half[0], solid.yaw[0]
-    middle, half = (solid.top[0] + solid.bottom[0]) / 2, (solid.top[0] - solid.bottom[0]) / 2
-    if solid.shape[0] == Shape.CYLINDER:
-        shape = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [u, half, 0.0]}
-    else:
-        shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [u, v, half]}
-        shape["quat"] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
-    return _body(model, solid).add_geom(pos=[x, y, middle], **shape, **_TOUCH)
-
-
-def _add_mesh(model: mujoco.MjSpec, solid: Solids) -> Any:
-    mesh = model.add_mesh(name=f"solid{len(model.meshes)}")
-    exact = triangulate(_blunt(solid))
-    mesh.uservert, mesh.userface = exact.vertices.flatten(), exact.triangles.flatten()
-    return _body(model, solid).add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **_TOUCH)
-
-
-def _body(model: mujoco.MjSpec, solid: Solids) -> Any:
-    return model.worldbody if solid.walkable[0] else model.body(OBSTACLES)
-
-
-def _blunt(solid: Solids) -> Solids:
-    """Nothing thinner than a centimetre: the sharp edge of a wedge would be no triangle."""
-    low = solid.top - solid.bottom - np.abs(solid.slope_top - solid.slope_bottom) * solid.half[:, 0]
-    return replace(solid, bottom=solid.bottom - np.maximum(0.01 - low, 0.0))
+def _corners(solids: Solids) -> NDArray[np.float64]:
+    """(n, 8, 3) corners of boxes in the frame of their middle and yaw; nothing thinner than a centimetre, since the
+    sharp edge of a wedge would be no triangle."""
+    u, v = solids.half[:, :1] * np.array([1, 1, -1, -1]), solids.half[:, 1:] * np.array([1, -1, 1, -1])
+    half = ((solids.top - solids.bottom) / 2)[:, None]
+    upper = half + solids.slope_top[:, None] * u
+    lower = -half + solids.slope_bottom[:, None] * u
+    lower -= np.maximum(0.01 - (upper - lower).min(1, keepdims=True), 0.0)
+    return np.concatenate([np.stack([u, v, z], axis=-1) for z in (upper, lower)], axis=1)
 
 
 def surfaces(tile: Tile, cell: float = CELL) -> NDArray[np.int16]:

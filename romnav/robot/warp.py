@@ -2,36 +2,56 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco_warp
+import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
-from romnav.robot.g1 import Robots, Statics
+from romnav.robot.g1 import Robots
 from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import FIELDS, Geoms
 
 CONTACTS, CONSTRAINTS = 48, 256
 """Room for contacts and constraint rows of one robot."""
 
 
 class WarpHumanoids(Robots):
-    """`Robots` stepped by MuJoCo Warp, all on one ground. Tensors that are passed and kept lie on the CPU.
+    """`Robots` stepped by MuJoCo Warp. Tensors that are passed and kept lie on the CPU.
 
     Args:
         spec: of the robot.
-        ground: of all.
+        grounds: that robots may be on.
         count: of robots.
         device: of Warp.
     """
 
-    def __init__(self, spec: RobotSpec, ground: Statics, count: int, *, device: str = "cuda") -> None:
-        super().__init__(spec, ground, count)
+    def __init__(self, spec: RobotSpec, grounds: Sequence[Geoms], count: int, *, device: str = "cuda") -> None:
+        super().__init__(spec, grounds, count)
         self.device = device
         with wp.ScopedDevice(device):
             self._warp = mujoco_warp.put_model(self.model)
             self._data = mujoco_warp.make_data(self.model, nworld=count, nconmax=CONTACTS, njmax=CONSTRAINTS)
+            self._held = {name: self._each(name) for name in FIELDS}
         self._derive()
-        self._read()
+
+    def _each(self, name: str) -> NDArray:
+        """A field of the model, from now on of each robot's own: a copy (n, ...) on the CPU."""
+        shared = getattr(self._warp, name)
+        each = np.repeat(shared.numpy(), self.count, axis=0)
+        setattr(self._warp, name, wp.array(each, dtype=shared.dtype, ndim=shared.ndim))
+        return each.reshape(self.count, *getattr(self.model, name).shape)
+
+    def _surround(self, pelvis: NDArray[np.float64]) -> NDArray[np.int64]:
+        moved = super()._surround(pelvis)
+        rows = torch.from_numpy(moved).to(self.device)
+        for name, held in self._held.items():
+            own: Tensor = wp.to_torch(getattr(self._warp, name))
+            own[rows] = torch.from_numpy(held[moved]).reshape(len(moved), *own.shape[1:]).to(self.device)
+        return moved
 
     def _array(self, name: str) -> Tensor:
         view: Tensor = wp.to_torch(getattr(self._data, name))
@@ -40,13 +60,14 @@ class WarpHumanoids(Robots):
     def _field(self, name: str) -> Tensor:
         return self._array(name).to("cpu", copy=True)
 
-    def _derive(self) -> None:
-        """Everything that depends on positions and velocities."""
+    def _derive(self, ids: NDArray | None = None) -> None:
+        self._surround(self._field("qpos")[:, :3].double().numpy())
         with wp.ScopedDevice(self.device):
             mujoco_warp.fwd_position(self._warp, self._data)
             mujoco_warp.sensor_pos(self._warp, self._data)
             mujoco_warp.fwd_velocity(self._warp, self._data)
             mujoco_warp.sensor_vel(self._warp, self._data)
+        self._read()
 
     def step(self, target: Tensor, ids: Tensor | None = None) -> None:
         """Drive the joints towards position targets (n, 15), rad, for one control step (20 ms); all, or only `ids`."""
@@ -55,6 +76,7 @@ class WarpHumanoids(Robots):
         rest[slice(None) if ids is None else ids] = False
         kept = {name: self._array(name)[rest].clone() for name in names}
         self._array("ctrl").copy_(target)
+        self._surround(self.pelvis.double().numpy())
         with wp.ScopedDevice(self.device):
             for _ in range(self.spec.decimation):
                 mujoco_warp.step(self._warp, self._data)
@@ -64,7 +86,6 @@ class WarpHumanoids(Robots):
         self.touch = torch.where(rest[:, None], self.touch, touch)
         self.torque = self._field("actuator_force")
         self._derive()
-        self._read()
 
     def set_state(self, ids: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put robots `ids` into states (k, 22) and (k, 21); they touch nothing until they are stepped."""
@@ -73,7 +94,6 @@ class WarpHumanoids(Robots):
         self._array("qacc_warmstart")[ids] = 0.0
         self.touch[ids], self.torque[ids] = False, 0.0
         self._derive()
-        self._read()
 
     def state(self, ids: Tensor) -> tuple[Tensor, Tensor]:
         """States (k, 22) and (k, 21) of robots `ids`, float32."""

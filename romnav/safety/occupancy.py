@@ -21,10 +21,10 @@ import torch
 
 from romnav.errors import RomnavError
 from romnav.kernels import wp
-from romnav.safety.spec import OccupancySpec
+from romnav.safety.spec import GROUND_CELLS, OccupancySpec
 
 # Occupancy cells along a side of a ground cell: enough returns in each on the ground a few metres away.
-_GROUND_CELLS = wp.constant(2)
+_GROUND_CELLS = wp.constant(GROUND_CELLS)
 _UNSEEN = wp.constant(wp.inf)
 
 
@@ -297,26 +297,12 @@ class Occupancy:
 
 
 class Rasterizer:
-    """Point clouds of ``robots`` robots to occupancy grids around them.
-
-    Raises:
-        RomnavError: The grid does not hold the robot, or the robot is smaller than a cell.
-    """
+    """Point clouds of ``robots`` robots to occupancy grids around them."""
 
     def __init__(self, robots: int, spec: OccupancySpec | None = None, device: str = "cpu") -> None:
         self.spec = spec = spec or OccupancySpec()
-        if spec.radius < spec.cell:
-            raise RomnavError(
-                f"occupancy.radius {spec.radius} m is smaller than occupancy.cell {spec.cell} m; choose smaller cells"
-            )
-        coarse = round(spec.size / (_GROUND_CELLS * spec.cell))
-        cells = _GROUND_CELLS * coarse
+        cells, coarse = spec.cells, spec.cells // GROUND_CELLS
         self._reach = spec.radius + spec.margin
-        if cells * spec.cell <= 4 * self._reach:
-            raise RomnavError(
-                f"occupancy.size {spec.size} m is too small for a robot of radius {spec.radius} m and a margin "
-                f"of {spec.margin} m; at least four times their sum is needed"
-            )
         self.shape = (cells, cells)
         self.centre = (cells - 1) * spec.cell / 2
         """Where the robot stands, from the centre of cell (0, 0), along both axes, m."""

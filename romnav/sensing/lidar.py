@@ -13,6 +13,7 @@ from torch import Tensor
 
 from romnav.kernels import wp
 from romnav.sensing import columns, visibility
+from romnav.sensing.image import angles, directions
 from romnav.sensing.sensor import Sensor
 from romnav.sensing.spec import LidarSpec
 from romnav.world.mesh import triangulate
@@ -48,19 +49,16 @@ class Lidar(Sensor):
         self.device = device
         width = math.radians(spec.azimuth)
         low, high = (math.radians(e) for e in spec.elevation)
-        azimuth = width * (0.5 - (np.arange(spec.columns) + 0.5) / spec.columns)
-        elevation = high - (high - low) * (np.arange(spec.rows) + 0.5) / spec.rows
+        azimuth, elevation = angles(spec)
         heading = np.stack([np.cos(azimuth), np.sin(azimuth), np.ones_like(azimuth)])
-        cos, sin = np.cos(elevation), np.sin(elevation)
-        rays = np.stack([cos, cos, sin], axis=1)[:, None] * heading.T
-        self.directions = torch.tensor(rays, dtype=torch.float32, device=device).contiguous()
+        self.directions = directions(spec).to(device)
         self._heading = torch.tensor(heading, dtype=torch.float32, device=device)
 
         image = columns.Image()
         image.rows, image.columns = spec.rows, spec.columns
         image.slope = wp.array(np.tan(elevation), dtype=float, device=device)
-        image.cos = wp.array(cos, dtype=float, device=device)
-        image.sin = wp.array(sin, dtype=float, device=device)
+        image.cos = wp.array(np.cos(elevation), dtype=float, device=device)
+        image.sin = wp.array(np.sin(elevation), dtype=float, device=device)
         image.heading_x, image.heading_y = columns.lanes(self._heading[0]), columns.lanes(self._heading[1])
         image.left, image.columns_per_radian = width / 2, spec.columns / width
         image.top, image.rows_per_radian = high, spec.rows / (high - low)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
-from romnav import files, random
+from romnav import files, random, stopping
 from romnav.errors import RomnavError
 from romnav.precision import reduced_precision
 from romnav.progress import Progress
@@ -38,7 +38,7 @@ WARM_UP = 25
 LOG_INTERVAL = 25
 """Gradient steps between two rows of the curve."""
 CHECKPOINT_INTERVAL = 500
-"""Gradient steps between two states for resumption; a multiple of `LOG_INTERVAL`."""
+"""Gradient steps between two states for resumption."""
 DEAD_VARIANCE = 0.01
 """A latent dimension whose posterior mean varies less over images is dead (Burda et al. 2016)."""
 TERMS = ("range", "xyz", "valid", "classes", "divergence")
@@ -173,16 +173,17 @@ def pretrain(
     if resume and state_path.exists():
         state.restore(state_path)
     # batches are small: a second thread gains nothing, and another number of threads gives other bits
-    with torch_threads(1):
+    with torch_threads(1), stopping.deferred() as stop:
         while state.step < state.steps:
             text = state.advance()
             done = min(state.step * spec.batch, spec.images * spec.epochs)
             progress(done, spec.images * spec.epochs, text)
-            if state.step % CHECKPOINT_INTERVAL == 0 and state.step < state.steps:
+            if stop or (state.step % CHECKPOINT_INTERVAL == 0 and state.step < state.steps):
                 state.save(state_path)
+            stop.obey()
     files.write(out / "curve.csv", state.curve())
+    state.check()
     checkpoints.save(path, state.model, {"key": key})
-    state_path.unlink(missing_ok=True)
     return path
 
 
@@ -241,11 +242,22 @@ class _Training:
         terms = loss_terms(self.model, spec, seen, clean, labels, generator)
         return torch.stack([terms[name] for name in TERMS])
 
+    def check(self) -> None:
+        """Stop before weights that are not finite are saved."""
+        wrong = [name for name, value in self.model.state_dict().items() if not bool(value.isfinite().all())]
+        if wrong:
+            raise RomnavError(
+                f"pretraining: step {self.step}: {', '.join(wrong[:3])} not finite; what is saved is of a step before. "
+                "Lower learning_rate"
+            )
+
     def save(self, path: Path) -> None:
+        self.check()
         extra = {
             "key": self._key,
             "step": self.step,
             "rows": self._rows,
+            "recent": self._recent,
             "optimizer": self._optimizer.state_dict(),
         }
         checkpoints.save(path, self.model, extra)
@@ -257,7 +269,7 @@ class _Training:
             return
         self.model.load_state_dict(content["weights"])
         self._optimizer.load_state_dict(content["optimizer"])
-        self.step, self._rows = content["step"], content["rows"]
+        self.step, self._rows, self._recent = content["step"], content["rows"], content["recent"]
 
     def curve(self) -> str:
         text = io.StringIO()
@@ -300,7 +312,7 @@ def quality(
         and all of it in ``dropout_50``.
     """
     poses = Poses([grids for _, grids in tiles], height, seed, device)
-    kinds = np.array([tile.kind.value for tile, _ in tiles])
+    kinds = np.array([tile.kind for tile, _ in tiles])
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
         corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)

@@ -13,7 +13,7 @@ from torch import Tensor
 from romnav.world.grids import Grids
 from romnav.world.solids import Solids
 from romnav.world.spec import WorldSpec
-from romnav.world.tile import Connector, Tile, TileClass
+from romnav.world.tile import Connector, Tile
 from romnav.world.world import World
 
 TENSORS = [field.name for field in fields(World) if field.type == Tensor.__name__]
@@ -58,7 +58,7 @@ def _describe(tile: Tile) -> dict[str, Any]:
 
 def _tile(spec: WorldSpec, told: dict[str, Any], solids: Solids) -> Tile:
     return Tile(
-        kind=TileClass(told["kind"]),
+        kind=told["kind"],
         index=told["index"],
         side=spec.side,
         solids=solids,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from romnav.world.solids import Solids
+from romnav.world.spec import WorldSpec
 
 
 class TileClass(StrEnum):
@@ -45,7 +47,8 @@ class Tile:
     the half landing of a stacked staircase may be a layer of its own, then ``storeys`` leaves it out.
     """
 
-    kind: TileClass
+    kind: str
+    """A `TileClass`, or the name of one from outside."""
     index: int
     """Number of the tile within its world."""
     side: float
@@ -61,3 +64,14 @@ class Tile:
     def multi_story(self) -> bool:
         """Whether one (x, y) can hold several goals, one per floor."""
         return len(self.storeys) > 1
+
+
+class TileGenerator(Protocol):
+    """A tile class: draws tiles from random numbers."""
+
+    smallest: float
+    """Least side at which it finds room for what belongs to it, m."""
+
+    def __call__(self, rng: np.random.Generator, spec: WorldSpec, index: int) -> Tile:
+        """Tile ``index`` of a world; it is drawn again until all of it is reachable."""
+        ...

@@ -41,6 +41,24 @@ def test_results_are_printed_for_people_and_for_scripts(evaluated: Path) -> None
     assert data["episode_set"] in text
 
 
+def test_each_arm_is_compared_with_its_experiments_reference(evaluated: Path) -> None:
+    def pairs(*words: str) -> list[str]:
+        lines = [line.split("│") for line in romnav(*words).stdout.splitlines() if "│ 120 │ cross" in line]
+        return [line[1].strip() for line in lines]
+
+    assert pairs("results") == [f"rom - {other}" for other in ("uniform", "nocap", "oracle", "straight")]
+    assert len(pairs("results", "--all-pairs")) == 10
+    assert "McNemar" not in romnav("results").stdout
+    assert "McNemar" in romnav("results", "--verbose").stdout
+
+
+def test_what_cannot_be_compared_is_one_clear_error(project: Path) -> None:
+    assert fails("eval", "rom", "uniform", "rom") == "rom is named twice; name each arm once"
+    assert fails("eval", "--paired", "rom").startswith("--paired compares arms: name one beside rom, or none")
+    assert fails("eval").startswith("name arms, or compare all that are trained by `romnav eval --paired`")
+    assert fails("eval", "--paired").endswith("no arm is trained; run `romnav run ablation spawn-goal --scale smoke`")
+
+
 def test_results_before_any_evaluation_are_an_error(project: Path) -> None:
     assert "no arm has been evaluated" in fails("results")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.cli.conftest import romnav
+from tests.cli.conftest import edit, fails, romnav
 
 
 def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> None:
@@ -12,4 +12,24 @@ def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> N
     files = [file.stem for file in sorted((evaluated / "experiments").glob("*.toml"))]
     assert [line.split(":")[0] for line in lines if not line.startswith(" ")] == files
     assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in lines]
-    assert ["uniform-nocap", "UniformNoCap", "(RoM)"] in [line.split() for line in lines]
+    assert ["uniform-nocap", "UniformNoCap"] in [line.split() for line in lines]
+
+
+def test_metrics_have_names_units_and_directions(project: Path) -> None:
+    lines = romnav("list", "metrics").stdout.splitlines()
+    assert "t2g         T2G: mean time to goal over successful episodes (s, lower is better)" in lines
+    assert fails("list", "metrcs") == "there is no list of metrcs; did you mean metrics?"
+
+
+def test_list_shows_the_others_beside_a_broken_file(evaluated: Path) -> None:
+    broken = evaluated / "experiments" / "search.toml"
+    edit(broken, "title =", "titel =")
+    (evaluated / "results" / "smoke" / "rom" / "seed-0.bak").mkdir()
+    (evaluated / "results" / "smoke" / "rom" / "seed-0.bak" / "episodes.parquet").write_bytes(b"old")
+    listed = romnav("list")
+    assert listed.exit_code == 1
+    assert listed.stderr.splitlines() == [f"error: {broken}: key title is missing"]
+    assert ["rom", "RoM", "smoke:", "seed", "0"] in [line.split() for line in listed.stdout.splitlines()]
+    assert romnav("results").exit_code == 0
+    assert romnav("tables", "spawn-goal").exit_code == 0
+    assert romnav("tables").stderr.splitlines()[-1] == f"error: {broken}: key title is missing"

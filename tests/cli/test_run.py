@@ -100,8 +100,8 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     assert again.stdout == result.stdout
     edit(
         project / "experiments" / "spawn-goal.toml",
-        'cap = "euclidean"\n\n',
-        'cap = "euclidean"\nnavigation.ppo.gamma = 0.9\n\n',
+        'cap = "euclidean"\n\n[arms.uniform-nocap]',
+        'cap = "euclidean"\nnavigation.ppo.gamma = 0.9\n\n[arms.uniform-nocap]',
     )
     planned = romnav(*command, "--print").stdout.splitlines()
     assert ran == []
@@ -115,6 +115,13 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     assert romnav("train", "policy", "rom", "--no-resume").exit_code == 0
     assert ran == ["policy rom, seed 0"]
     assert "rom" in romnav("eval", "--paired", "rom", "uniform").stdout
+    ran.clear()
+    (project / "results" / "smoke" / "uniform" / "seed-0" / "policy.pt").unlink()
+    compared = romnav("eval", "--paired")
+    assert compared.exit_code == 0, compared.output
+    assert ran == []  # everything is evaluated already
+    assert "left out: policy uniform, seed 0 is unfinished" in compared.stderr
+    assert "uniform-nocap" in compared.stdout
 
 
 def test_learning_curves_need_training_alone(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ from romnav.robot.humanoid import Humanoid
 from romnav.robot.locomotion.train import train as train_locomotion
 from romnav.robot.rom import ReducedOrderModel
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
+from romnav.stopping import Stopped
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
 from romnav.world.world import World
@@ -97,7 +98,6 @@ def test_killed_and_resumed_equals_left_alone(
     assert checkpoint.read(tmp_path / "killed" / "checkpoint.pt")["iterations"] == 2
     train.train(spec, world, perception, tmp_path / "killed", 1)
     assert_same(weights(tmp_path / "whole"), weights(tmp_path / "killed"))
-    assert not (tmp_path / "killed" / "checkpoint.pt").exists()
     curves = [
         [{**row, "seconds": "", "cpu_seconds": ""} for row in csv.DictReader((tmp_path / name / "curve.csv").open())]
         for name in ("whole", "killed")
@@ -133,6 +133,22 @@ def test_the_encoder_is_trained_from_its_iteration_on(world: World, spec: Naviga
     assert changed == {f"{part}.{kind}" for part in ("trunk.0", "mean") for kind in ("weight", "bias")}
     assert perception.encoder.digest() == fake_encoder().digest()
     assert not any(k.startswith("encoder.") for k in weights(tmp_path / "frozen"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_saves_first_and_the_run_goes_on_from_there(
+    world: World, spec: NavigationSpec, tmp_path: Path, number: signal.Signals
+) -> None:
+    def progress(done: int, total: int, metric: str) -> None:
+        if done == total // 2:
+            signal.raise_signal(number)
+
+    with pytest.raises(Stopped):
+        train.train(spec, world, FakePerception(), tmp_path, 1, progress=progress)
+    assert checkpoint.read(tmp_path / "checkpoint.pt")["iterations"] == spec.ppo.iterations // 2
+    seen: list[int] = []
+    train.train(spec, world, FakePerception(), tmp_path, 1, progress=lambda done, total, metric: seen.append(done))
+    assert len(seen) == spec.ppo.iterations // 2
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.75], ids=["from the start", "before", "at", "after the stop"])

@@ -2,27 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import pytest
 
 from romnav.evaluation import episodes, tracks
 from romnav.evaluation.paired import rows
 from romnav.evaluation.paired.run import run
+from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.evaluation.rollout import SCRIPTED
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
+from romnav.experiment.project import Project
 from romnav.navigation.spec import EnvSpec
+from romnav.report.formats import Table
+from romnav.report.paired import tables
 from romnav.report.paired.gallery import EpisodeGallery
-from romnav.world.build import build
+from romnav.report.spec import PAIRED
+from romnav.world.build import build as build_world
 from romnav.world.spec import SamplerSpec, WorldSpec
 
+ROOT = Path(__file__).parents[2]
+PAPER = Project(ROOT, ROOT / "results")
 Walk = Callable[[int], dict[str, EpisodeGallery]]
+
+
+@pytest.fixture(scope="session")
+def papers_tables() -> Callable[[Sequence[rows.Arm]], dict[str, Table]]:
+    """Makes those of the paper's tables of paired episodes that compare some of these arms."""
+
+    def build(arms: Sequence[rows.Arm]) -> dict[str, Table]:
+        bootstrap, made = Bootstrap(arms), {}
+        for experiment in ("spawn-goal", "kickstart"):
+            declared = PAPER.experiment(experiment).declared(experiment, PAIRED)
+            for name, spec in declared.tables.items():
+                if len(tables.evaluated(spec, bootstrap)) > 1:
+                    made[name] = tables.build(name, spec, declared.title, bootstrap, PAPER.published(experiment))
+        return made
+
+    return build
 
 
 @pytest.fixture(scope="session")
 def walk() -> Walk:
     """Lets both scripted arms walk a number of episodes on three tiles, a building, an outdoor one and a room."""
-    world = build(WorldSpec(tiles=3, seed=51, goals_per_tile=12))
+    world = build_world(WorldSpec(tiles=3, seed=51, goals_per_tile=12))
 
     def walked(count: int) -> dict[str, EpisodeGallery]:
         spec = EpisodeSetSpec(

@@ -12,6 +12,7 @@ import pytest
 
 from romnav.errors import RomnavError
 from romnav.report import curves, formats
+from romnav.report.spec import Published
 
 ITERATIONS = 30
 
@@ -71,7 +72,9 @@ def test_iteration_times_are_of_the_phases_and_shrug_off_outliers(arms: dict[str
 
 
 def test_the_table_has_our_rows_and_the_papers(arms: dict[str, curves.Curves]) -> None:
-    table = curves.tabulate("pretrain", "Encoder", arms, {"scale": "smoke", "commit": "abc"}, dict.fromkeys(arms, ()))
+    paper = Published(title="Paper", arms={"frozen": {"iteration_time": 1.0}, "unfrozen": {"iteration_time": 1.15}})
+    provenance, sources = {"scale": "smoke", "commit": "abc"}, dict.fromkeys(arms, ())
+    table = curves.tabulate("pretrain", "Encoder.", arms, provenance, sources, paper)
     ours, published = table.blocks
     assert [row.label for row in ours.rows] == ["Frozen", "Unfrozen @ half", "No Pretraining"]
     assert [row.cells[2].text for row in ours.rows] == ["1.00", "1.50", "1.50"]
@@ -80,6 +83,9 @@ def test_the_table_has_our_rows_and_the_papers(arms: dict[str, curves.Curves]) -
     assert ours.rows[1].cells[1].text == f"{final.lo:.1f} to {final.hi:.1f}"
     assert final.lo < ours.rows[1].cells[0].value < final.hi
     assert "training seeds per arm: 3" in table.caption
+    assert table.caption.endswith("commit abc. Paper: as published, wall-clock time on a GPU.")
+    alone = curves.tabulate("pretrain", "Encoder.", arms, provenance, sources)
+    assert (len(alone.blocks), alone.caption[-4:]) == (1, "abc.")
     for render in (formats.latex, formats.markdown, formats.to_csv):
         assert "No Pretraining" in render(table)
 

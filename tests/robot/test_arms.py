@@ -9,8 +9,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from romnav.robot.arms import STEP, OwnArms
-from romnav.robot.g1 import HEAD, NOTHING, build_spec
+from romnav.robot.g1 import HEAD, build_spec
 from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import NOTHING
 
 AZIMUTH, ELEVATION = np.meshgrid(np.radians(np.linspace(110, -110, 23)), np.radians(np.linspace(0, -60, 9)))
 RAYS = np.stack([np.cos(ELEVATION) * np.cos(AZIMUTH), np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION)], axis=-1)

@@ -8,6 +8,7 @@ import torch
 from romnav.robot import g1
 from romnav.robot.body import BodyModel, Obstacles
 from romnav.robot.spec import BodySpec, RobotSpec
+from romnav.robot.statics import Geoms
 from romnav.world.scenes.obstacles import obstacle_scenes
 from romnav.world.scenes.scene import scene_world
 from romnav.world.solids import Label, Solids, SolidsBuilder
@@ -163,7 +164,7 @@ def test_selected_robots_go_on(world: World) -> None:
 
 
 def test_the_cylinder_holds_the_model_of_the_robot() -> None:
-    ground = g1.Boxes(np.array([[0.0, 0.0, -0.1]]), np.array([[3.0, 3.0, 0.1]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    ground = Geoms.boxes(np.array([[0.0, 0.0, -0.1]]), np.array([[3.0, 3.0, 0.1]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
     model = g1.build_spec(RobotSpec(), ground, visual=True).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

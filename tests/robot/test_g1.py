@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from romnav.robot.g1 import FOOT_LENGTH, JOINTS, SOLE, Boxes, Humanoids, build_spec
+from romnav.robot.g1 import FOOT_LENGTH, JOINTS, SOLE, Humanoids, build_spec
 from romnav.robot.spec import RobotSpec
-from romnav.robot.tiles import TileGeoms
+from romnav.robot.statics import NOTHING, Geoms
+from romnav.robot.tiles import geoms
 from romnav.world.solids import SolidsBuilder
 
-PLANE = Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
-BLOCK = Boxes(np.array([[0.0, 0.0, 0.25]]), np.array([[3.0, 3.0, 0.25]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
+PLANE = NOTHING
+BLOCK = Geoms.boxes(np.array([[0.0, 0.0, 0.25]]), np.array([[3.0, 3.0, 0.25]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
 
 
 def stand(robots: Humanoids, height: float) -> None:
@@ -48,9 +49,9 @@ def test_welded_arms_are_where_the_joints_would_put_them() -> None:
 
 
 @pytest.mark.parametrize(("ground", "top"), [(PLANE, 0.0), (BLOCK, 0.5)])
-def test_the_ground_carries_the_robot_and_soles_do_not_sink(ground: Boxes, top: float) -> None:
+def test_the_ground_carries_the_robot_and_soles_do_not_sink(ground: Geoms, top: float) -> None:
     """A fall of 5 cm on straight legs: both kinds of ground hold, the feet alone touch, the forces are the weight."""
-    robots = Humanoids(RobotSpec(), ground, 1, threads=1)
+    robots = Humanoids(RobotSpec(), [ground], 1, threads=1)
     stand(robots, top + 0.793 + 0.05)
     lowest = []
     for _ in range(40):
@@ -72,7 +73,7 @@ def test_the_ground_carries_the_robot_and_soles_do_not_sink(ground: Boxes, top: 
 def test_states_do_not_depend_on_threads_and_continue_from_a_saved_state() -> None:
     torch.manual_seed(0)
     actions = 0.2 * torch.randn(12, 3, 15)
-    a, b, c = (Humanoids(RobotSpec(), BLOCK, 3, threads=k) for k in (1, 2, 1))
+    a, b, c = (Humanoids(RobotSpec(), [BLOCK], 3, threads=k) for k in (1, 2, 1))
     for robots in (a, b):
         stand(robots, 1.28)
     for k, action in enumerate(actions):
@@ -89,7 +90,7 @@ def test_states_do_not_depend_on_threads_and_continue_from_a_saved_state() -> No
 
 
 def test_heavier_robots_sag_more_and_slippery_soles_slide() -> None:
-    robots = Humanoids(RobotSpec(), PLANE, 3, threads=1)
+    robots = Humanoids(RobotSpec(), [PLANE], 3, threads=1)
     robots.randomize(torch.tensor([0.8, 0.8, 0.05]), torch.tensor([0.0, 10.0, 0.0]))
     bent = torch.tensor([-0.3, 0, 0, 0.6, -0.3, 0] * 2 + [0.0] * 3).expand(3, -1)
     qpos = torch.cat([torch.tensor([[0.0, 0, 0.75, 1, 0, 0, 0]]).expand(3, -1), bent], dim=1)
@@ -109,12 +110,12 @@ def test_heavier_robots_sag_more_and_slippery_soles_slide() -> None:
 @pytest.mark.parametrize("obstacle", [True, False])
 def test_a_foot_kicks_an_obstacle_but_not_the_ground_that_it_walks_on(obstacle: bool) -> None:
     """A slab lower than the shin, with its upright face in the left toes: a sill, or the next step of a stair."""
-    free = Humanoids(RobotSpec(), PLANE, 1, threads=1)
+    free = Humanoids(RobotSpec(), [PLANE], 1, threads=1)
     stand(free, 0.793)
     toes = free.ankle[0, 0] + torch.tensor([SOLE[0] + FOOT_LENGTH / 2, 0.0, 0.0])
     builder, deep, layers = SolidsBuilder(), 0.004, (-1, -1) if obstacle else (0, 0)
     builder.box((float(toes[0]) - deep + 0.5, float(toes[1])), (1.0, 0.15), (0.0, 0.08), layers=layers)
-    robots = Humanoids(RobotSpec(), TileGeoms(builder.build(), 2, 0), 1, threads=1)
+    robots = Humanoids(RobotSpec(), [geoms(builder.build())], 1, threads=1)
     stand(robots, 0.793)
     for _ in range(3):
         robots.step(torch.zeros(1, 15))

@@ -31,7 +31,7 @@ def walk(control: Controller, ground: Ground, ticks: int, *, first: bool = False
 def walking() -> tuple[Controller, Ground, dict[str, torch.Tensor], torch.Tensor]:
     """A robot on the flat after half a second, its snapshot there, and its way on."""
     ground = Ground([flat()])
-    control = Controller(SPEC, Humanoids(SPEC.robot, ground.boxes, 2, threads=1))
+    control = Controller(SPEC, Humanoids(SPEC.robot, [ground.geoms], 2, threads=1))
     start = torch.tensor([[-60.0, 0.0, 0.0], [-40.0, 5.0, 0.0]])
     ids = torch.arange(2)
     control.stand(ids, start, torch.zeros(2), torch.zeros(2, dtype=torch.long), torch.tensor([[0.3, 0, 0]] * 2))

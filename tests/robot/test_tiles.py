@@ -1,16 +1,14 @@
-"""Tiles under the humanoid: geoms and heights against each other, and one layout for all tiles."""
+"""Tiles under the humanoid: geoms and heights against each other."""
 
 from __future__ import annotations
 
 import mujoco
-import mujoco.batch
 import numpy as np
 import pytest
 import torch
 
-from romnav.robot.g1 import OBSTACLES, build_spec
-from romnav.robot.spec import RobotSpec
-from romnav.robot.tiles import CELL, TileGeoms, TileHeights
+from romnav.robot.statics import OBSTACLES
+from romnav.robot.tiles import CELL, TileHeights, geoms
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Tile
 from romnav.world.tiles import generate
@@ -32,7 +30,7 @@ def test_rays_hit_the_ground_at_the_heights_of_the_map(tiles: list[Tile]) -> Non
         model = mujoco.MjSpec()
         model.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
         model.worldbody.add_body(name=OBSTACLES)
-        TileGeoms(walkable, len(walkable), len(walkable)).add_to(model)
+        geoms(walkable).add_to(model)
         compiled = model.compile()
         data = mujoco.MjData(compiled)
         mujoco.mj_forward(compiled, data)
@@ -58,11 +56,3 @@ def test_the_reach_chooses_the_storey(tiles: list[Tile]) -> None:
     assert (low <= 0.5).all()
     assert (high[high > 0.5] > low[high > 0.5]).all()
     assert (high > 3.0).any()
-
-
-def test_robots_of_one_batch_stand_on_different_tiles(tiles: list[Tile]) -> None:
-    models = [build_spec(RobotSpec(), geoms).compile() for geoms in TileGeoms.of(tiles)]
-    batch = mujoco.batch.Batch(models[0], 3, 1, persistent=True)
-    batch.set_models(models)
-    batch.step()
-    assert np.isfinite(batch.bind("qpos")).all()

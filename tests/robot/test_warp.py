@@ -12,9 +12,25 @@ from romnav.robot.g1 import Humanoids, Robots
 from romnav.robot.locomotion.task import Controller
 from romnav.robot.locomotion.terrain import Ground, flat, stairs
 from romnav.robot.spec import LocomotionSpec
+from romnav.robot.statics import Geoms
+from romnav.robot.tiles import geoms
 from romnav.robot.warp import WarpHumanoids
+from romnav.world.solids import SolidsBuilder
 
 SPEC = LocomotionSpec()
+
+
+def grounds() -> list[Geoms]:
+    """A platform, a ramp and, on the floor, a pillar at the robot's chest, all where robots start at (1, 1)."""
+    builders = [SolidsBuilder() for _ in range(3)]
+    builders[0].box((1.0, 1.0), (2.0, 2.0), (0.0, 0.4), layers=(0, 0))
+    builders[1].box((1.0, 1.0), (2.0, 2.0), (0.0, 0.2), slope=0.1, layers=(0, 0))
+    builders[2].cylinder((1.18, 1.0), 0.15, (0.5, 2.0))
+    return [geoms(builder.build()) for builder in builders]
+
+
+HEIGHTS = torch.tensor([0.4, 0.2, 0.0])
+
 GROUND = Ground([flat(), stairs(0, 0.1, 0.3, 0.3, 3)])
 
 
@@ -39,8 +55,8 @@ def walk(robots: Robots, ticks: int) -> dict[str, np.ndarray]:
 def test_both_engines_walk_alike() -> None:
     """Engines differ in precision and solver; chaos makes that visible after about a second, so half of one."""
     ticks = 25
-    native = walk(Humanoids(SPEC.robot, GROUND.boxes, 3, threads=1), ticks)
-    warp = walk(WarpHumanoids(SPEC.robot, GROUND.boxes, 3, device="cpu"), ticks)
+    native = walk(Humanoids(SPEC.robot, [GROUND.geoms], 3, threads=1), ticks)
+    warp = walk(WarpHumanoids(SPEC.robot, [GROUND.geoms], 3, device="cpu"), ticks)
     moved = np.abs(native["pelvis"][-1] - native["pelvis"][0]).max()
     assert moved > 0.05
     for name, tolerance in {
@@ -57,3 +73,28 @@ def test_both_engines_walk_alike() -> None:
     assert np.array_equal(held, np.broadcast_to(held[0], held.shape))
     held = warp["pelvis"][5:, 2]
     assert np.array_equal(held, np.broadcast_to(held[0], held.shape))
+
+
+@pytest.mark.slow
+def test_every_robot_is_on_a_ground_of_its_own() -> None:
+    """Which change places on the way: what held them up, or was in the way, is then under another's feet."""
+    pose = torch.zeros(3, 22)
+    pose[:, :2], pose[:, 2], pose[:, 3] = 1.0, HEIGHTS + 0.795, 1.0
+    found = []
+    for robots in (
+        Humanoids(SPEC.robot, grounds(), 3, threads=1),
+        WarpHumanoids(SPEC.robot, grounds(), 3, device="cpu"),
+    ):
+        for ground in (torch.arange(3), torch.tensor([2, 0, 1])):
+            robots.stand_on(ground)
+            pose[:, 2] = HEIGHTS[ground] + 0.795
+            robots.set_state(torch.arange(3), pose, torch.zeros(3, 21))
+            for _ in range(5):
+                robots.step(torch.zeros(3, 15))
+            found.append((robots.pelvis.clone(), robots.touch.clone()))
+            torch.testing.assert_close(robots.pelvis[:, 2], pose[:, 2], atol=0.03, rtol=0)
+            assert robots.touch[:, robots.feet].all()
+            assert ((robots.touch.sum(1) > 2) == (ground == 2)).all(), "the pillar touches one"
+    for (at, touch), (same, touching) in zip(found[:2], found[2:], strict=True):
+        torch.testing.assert_close(at, same, atol=3e-3, rtol=0)
+        assert torch.equal(touch, touching)

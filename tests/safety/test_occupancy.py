@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from scipy.ndimage import distance_transform_edt
 
 from romnav.errors import RomnavError
@@ -259,10 +260,10 @@ def test_without_motion_nothing_is_remembered():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(RomnavError, match="smaller than occupancy"):
-        Rasterizer(1, OccupancySpec(radius=0.04))
-    with pytest.raises(RomnavError, match="is too small for a robot"):
-        Rasterizer(1, OccupancySpec(size=1.0))
+    with pytest.raises(ValidationError, match="smaller than a cell"):
+        OccupancySpec(radius=0.04)
+    with pytest.raises(ValidationError, match="too small for a radius"):
+        OccupancySpec(size=1.0)
     with pytest.raises(RomnavError, match="points have shape"):
         Rasterizer(2)(torch.zeros(1, 5, 3))
     with pytest.raises(RomnavError, match="valid is"):

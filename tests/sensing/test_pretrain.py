@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import csv
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from romnav.errors import RomnavError
 from romnav.sensing import encoder as checkpoints
 from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.lidar import Lidar
 from romnav.sensing.pretrain import TERMS, Poses, divergence, loss_terms, pretrain, quality
 from romnav.sensing.spec import CorruptionSpec, DepthPretrainSpec, DepthSpec, EncoderSpec, LidarSpec, PretrainSpec
+from romnav.stopping import Stopped
 from romnav.world.grids import Grids, rasterise
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import GridSpec
@@ -177,7 +180,33 @@ def test_a_killed_run_resumes_to_the_same_weights(
     assert seen[0] == 11 * SPEC.batch
     expected, found = weights(trained), weights(tmp_path / "encoder.pt")
     assert all(torch.equal(expected[k], found[k]) for k in expected)
-    assert not (tmp_path / "state.pt").exists()
+
+
+def test_a_signal_saves_first_and_the_run_goes_on_to_the_same_weights_and_curve(
+    trained: Path, tiles: list[tuple[Tile, Grids]], lidar: Lidar, tmp_path: Path
+) -> None:
+    def stop(done: int, total: int, metric: str) -> None:
+        if done == 13 * SPEC.batch:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Stopped):
+        pretrain(SPEC, tiles, lidar, HEIGHT, tmp_path, progress=stop)
+    seen: list[int] = []
+    pretrain(SPEC, tiles, lidar, HEIGHT, tmp_path, progress=lambda done, total, metric: seen.append(done))
+    assert seen[0] == 14 * SPEC.batch
+    expected, found = weights(trained), weights(tmp_path / "encoder.pt")
+    assert all(torch.equal(expected[k], found[k]) for k in expected)
+    assert (tmp_path / "curve.csv").read_text() == trained.with_name("curve.csv").read_text()
+
+
+def test_weights_that_are_not_finite_are_not_saved(
+    tiles: list[tuple[Tile, Grids]], lidar: Lidar, tmp_path: Path
+) -> None:
+    """The step that breaks them may be the last: no loss tells."""
+    broken = SPEC.model_copy(update={"images": SPEC.batch, "epochs": 1, "learning_rate": 1e38, "weight_decay": 1e38})
+    with pytest.raises(RomnavError, match=r"step 1: .*weight.* not finite"):
+        pretrain(broken, tiles, lidar, HEIGHT, tmp_path)
+    assert not (tmp_path / "encoder.pt").exists()
 
 
 def test_threads_do_not_change_the_weights_and_a_finished_run_does_nothing(

@@ -64,7 +64,7 @@ def test_all_nodes_are_one_component_by_breadth_first_search(name: str, tiles: C
             floor = (
                 (grids.layer == storey) & ~grids.connector & (np.abs(grids.position[:, 2] - tile.layers[storey]) < 0.01)
             )
-            assert floor.sum() * grids.cell**2 > 20.0 or tile.kind is TileClass.OUTDOOR
+            assert floor.sum() * grids.cell**2 > 20.0 or tile.kind == TileClass.OUTDOOR
 
 
 @every_class

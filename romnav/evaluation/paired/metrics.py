@@ -18,30 +18,65 @@ from romnav.evaluation.paired.rows import HORIZONS, SUCCESS_RADIUS
 
 Level = Literal["all", "same", "cross"]
 LEVELS: tuple[Level, ...] = ("all", "same", "cross")
+Direction = Literal["higher", "lower"]
 
 
 @dataclass(frozen=True)
 class Metric:
     """A metric: ``scale * sum(numerator) / sum(denominator)``, both named quantities of an episode."""
 
+    label: str
+    """What tables call it."""
+    definition: str
+    """What it is, in a few words."""
     numerator: str
     denominator: str = "episodes"
     scale: float = 1.0
+    unit: str = ""
+    """Empty where it has none."""
+    better: Direction = "higher"
+    """Which values are the good ones."""
+    decimals: int = 1
+    """As many as tables show."""
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether it counts episodes, each of which has it or not."""
+        return self.denominator == "episodes" and self.unit == "%"
+
+
+def _rate(label: str, definition: str, numerator: str, better: Direction = "higher") -> Metric:
+    return Metric(label, definition, numerator, scale=100.0, unit="%", better=better)
 
 
 METRICS: dict[str, Metric] = {
-    **{f"sr_{horizon}": Metric(f"reached_{horizon}", scale=100.0) for horizon in HORIZONS},
-    "t2g": Metric("time_to_goal", "reached_120"),
-    "spl": Metric("spl"),
-    "soft_spl": Metric("soft_spl"),
-    "rmt": Metric("restricted_time"),
-    "falls": Metric("falls", scale=100.0),
-    "timeouts": Metric("timeouts", scale=100.0),
-    "collisions": Metric("collisions", "path", scale=100.0),
-}
-"""Success rates, falls and timeouts in percent; mean time to goal over successes (t2g) and restricted mean
-time with failures at 120 s (rmt) in s; SPL (Anderson et al. 2018) and SoftSPL (Datta et al. 2020) in 0..1;
-collisions per 100 m."""
+    **{f"sr_{h}": _rate(f"SR@{h}", f"success within {h} s", f"reached_{h}") for h in HORIZONS},
+    "t2g": Metric(
+        "T2G", "mean time to goal over successful episodes", "time_to_goal", "reached_120", unit="s", better="lower"
+    ),
+    "spl": Metric(
+        "SPL", "success weighted by path length against the geodesic route (Anderson et al. 2018)", "spl", decimals=3
+    ),
+    "soft_spl": Metric(
+        "SoftSPL", "progress weighted by path length against the geodesic route (Datta et al. 2020)", "soft_spl",
+        decimals=3,
+    ),
+    "rmt": Metric(
+        "RMT", f"mean time to goal, failures at {HORIZONS[-1]} s", "restricted_time", unit="s", better="lower"
+    ),
+    "falls": _rate("Falls", "episodes in which the robot fell", "falls", "lower"),
+    "timeouts": _rate("Timeouts", "episodes whose time ran out", "timeouts", "lower"),
+    "collisions": Metric(
+        "Contact", "steps with contact per 100 m walked", "collisions", "path", 100.0, "per 100 m", "lower"
+    ),
+}  # fmt: skip
+"""Every metric of paired episodes by name."""
+
+
+def split(name: str) -> tuple[str, Level]:
+    """Metric and level of a name: "sr_120" is of all episodes, "sr_120_cross" of those across levels."""
+    metric, _, level = name.rpartition("_")
+    return (metric, level) if level in ("same", "cross") else (name, "all")  # type: ignore[return-value]
 
 
 def quantities(columns: Mapping[str, NDArray]) -> dict[str, NDArray]:

@@ -37,17 +37,19 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Success rate of arm a minus that of arm b on the same episodes, in percent.
+    """A metric of arm a minus that of arm b on the same episodes; rates in percentage points.
 
     Attributes:
-        a_only: Episodes that only a solved; None where an arm has several training seeds.
-        b_only: Episodes that only b solved; None likewise.
+        metric: Name of the metric.
+        a_only: Episodes that only a counts in a rate, e.g. that only a solved; None where an arm has several training
+            seeds, and of other metrics.
+        b_only: Episodes that only b counts; None likewise.
         mid_p: McNemar mid-p value of the two; None likewise.
     """
 
     a: str
     b: str
-    horizon: int
+    metric: str
     level: Level
     diff: float
     lo: float
@@ -108,17 +110,18 @@ class Bootstrap:
         value, draws = self._ratio(arm, METRICS[metric], level)
         return Estimate(value, *self._interval(draws), n=int(self._masks[level].sum()))
 
-    def contrast(self, a: str, b: str, horizon: int = HORIZONS[-1], level: Level = "all") -> Contrast:
-        """Difference of two arms' success rates within a horizon."""
-        rate = METRICS[f"sr_{horizon}"]
-        (value_a, draws_a), (value_b, draws_b) = self._ratio(a, rate, level), self._ratio(b, rate, level)
+    def contrast(self, a: str, b: str, metric: str = f"sr_{HORIZONS[-1]}", level: Level = "all") -> Contrast:
+        """Difference of two arms in a metric of ``METRICS``."""
+        m = METRICS[metric]
+        (value_a, draws_a), (value_b, draws_b) = self._ratio(a, m, level), self._ratio(b, m, level)
         interval, mask = self._interval(draws_a - draws_b), self._masks[level]
         a_only = b_only = mid_p = None
-        if len(self.arms[a].runs) == len(self.arms[b].runs) == 1:
-            solved_a, solved_b = (self.arms[arm].runs[0].columns["success_time"][mask] <= horizon for arm in (a, b))
-            a_only, b_only = int((solved_a & ~solved_b).sum()), int((solved_b & ~solved_a).sum())
+        if m.is_rate and len(self.arms[a].runs) == len(self.arms[b].runs) == 1:
+            quantity = dict(self._runs)  # one run each
+            counts_a, counts_b = (quantity[arm][m.numerator][mask] > 0 for arm in (a, b))
+            a_only, b_only = int((counts_a & ~counts_b).sum()), int((counts_b & ~counts_a).sum())
             mid_p = mcnemar_mid_p(a_only, b_only)
-        return Contrast(a, b, horizon, level, value_a - value_b, *interval, int(mask.sum()), a_only, b_only, mid_p)
+        return Contrast(a, b, metric, level, value_a - value_b, *interval, int(mask.sum()), a_only, b_only, mid_p)
 
     def _ratio(self, arm: str, metric: Metric, level: Level) -> tuple[float, NDArray]:
         """The metric's value, and its value in every resample, shape (resamples,)."""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+from romnav import stopping
 from romnav.errors import RomnavError
 from romnav.experiment.graph.run import execute, waves
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import lines
+from romnav.threads import cores
 
 
 def execute_side_by_side(stages: Iterable[Stage], session: Session, say: Callable[[str], None]) -> None:
@@ -26,14 +27,15 @@ def execute_side_by_side(stages: Iterable[Stage], session: Session, say: Callabl
     for wave in waves(stages):
         commands = {stage.name: [*stage.command, *over] for stage in wave if stage.command}
         if commands:
-            side_by_side(commands, os.cpu_count() or 1)
+            side_by_side(commands, cores())
         execute([stage for stage in wave if not stage.command], session, say)
 
 
 def side_by_side(commands: Mapping[str, Sequence[str]], workers: int) -> None:
     """Run ``romnav`` command lines by the name of their stage, at most ``workers`` at a time.
 
-    Their progress shows as one line each. When one fails, the others are stopped; what they have done is kept.
+    Their progress shows as one line each. When one fails, the others are stopped; what they have done is kept. They end
+    with this process, however it ends.
 
     Raises:
         RomnavError: With the message of the first command that failed.
@@ -45,11 +47,18 @@ def side_by_side(commands: Mapping[str, Sequence[str]], workers: int) -> None:
         if stop.is_set():
             return
         command = [sys.executable, "-m", "romnav.cli", *arguments]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        environment = {**stopping.child(), "OMP_NUM_THREADS": "1"}
         with subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
         ) as process:
             running.append(process)
+            if stop.is_set():  # since the look above
+                process.terminate()
             last = ""
             assert process.stderr is not None
             for line in process.stderr:

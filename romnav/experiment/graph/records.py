@@ -6,8 +6,10 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -107,19 +109,60 @@ def _read_what_is_there(stage: Stage, record: Record) -> bool:
     return True
 
 
+def retrieve(stage: Stage) -> bool:
+    """Puts the files of a resumable stage's run with other settings aside, and those of this run back in place.
+
+    Both may be interrupted at any point and done again: a record goes last and comes last.
+
+    Returns:
+        Whether this run had been put aside.
+
+    Raises:
+        RomnavError: The present record is damaged.
+    """
+    if not stage.scratch:
+        return False
+    names = [*dict.fromkeys((*stage.scratch, *stage.beside, *stage.outputs)), stage.record.name]
+    old, mine = read(stage), _aside(stage, stage.key)
+    if old and old.key != stage.key:
+        present = [name for name in names if (stage.folder / name).exists()]
+        if present == [stage.record.name] and not old.outputs:
+            stage.record.unlink()  # it had only been begun
+        else:
+            _move(present, stage.folder, _aside(stage, old.key))
+    if not mine.is_dir():
+        return False
+    _move([name for name in names if (mine / name).exists()], mine, stage.folder)
+    shutil.rmtree(mine)
+    return True
+
+
+def _aside(stage: Stage, key: str) -> Path:
+    return stage.folder / "replaced" / key[:16]
+
+
+def _move(names: Sequence[str], source: Path, target: Path) -> None:
+    """Moves files and folders; those that are there already stay as they are."""
+    target.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        if not (target / name).exists():
+            (source / name).rename(target / name)
+
+
 def begin(stage: Stage, resume: bool) -> Record:
-    """Marks a resumable stage as begun, and drops what a different run of it left to be resumed.
+    """Marks a resumable stage as begun; without ``resume``, drops what there is of it.
 
     Raises:
         RomnavError: Its folder cannot be written, which is better known before the work than after it.
     """
     record = Record(stage.key, stage.spec)
     if stage.scratch:
-        old = read(stage)
-        if not resume or old is None or old.key != stage.key:
-            for path in (stage.folder / name for name in stage.scratch):
-                if path.exists():
-                    path.unlink()
+        if not resume or read(stage) is None:
+            for path in (stage.folder / name for name in (*stage.scratch, *stage.beside)):
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
         _write(stage, record)
     return record
 
@@ -131,11 +174,12 @@ def finish(stage: Stage, record: Record, facts: dict[str, Any], seconds: float) 
     record.upstream = {name: other.outputs for name, other in above.items() if other}
     record.outputs = {name: digest(stage.folder / name) for name in stage.outputs}
     record.facts = facts
-    if old and all(getattr(old, name) == getattr(record, name) for name in ("key", "upstream", "outputs", "facts")):
-        return
-    record.seconds = round(seconds, 1)
-    record.provenance = provenance()
-    _write(stage, record)
+    if not old or any(getattr(old, name) != getattr(record, name) for name in ("key", "upstream", "outputs", "facts")):
+        record.seconds = round(seconds, 1)
+        record.provenance = provenance()
+        _write(stage, record)
+    for name in stage.scratch:  # a run that is killed before this goes on from there
+        (stage.folder / name).unlink(missing_ok=True)
 
 
 def _write(stage: Stage, record: Record) -> None:

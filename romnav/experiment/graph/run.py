@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Collection, Iterable
+from functools import partial
 from pathlib import Path
 
 from romnav import files
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
+from romnav.experiment.graph.lock import held
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import bar
 
@@ -51,17 +54,20 @@ def require(stage: Stage, reader: Stage) -> None:
     Raises:
         RomnavError: It is not, or was made with other settings.
     """
+    if reason := missing(stage):
+        command = shlex.join(("romnav", *stage.command))
+        raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
+
+
+def missing(stage: Stage) -> str:
+    """Why a stage is not finished, as the end of a sentence; empty if it is."""
     if records.finished(stage):
-        return
-    changed = "; ".join(records.differences(stage))
-    if changed:
-        reason = f"was made with other settings ({changed})"
-    elif stage.record.exists():
-        reason = "is unfinished, or something that it was made from has changed since"
-    else:
-        reason = "is missing"
-    command = " ".join(("romnav", *stage.command))
-    raise RomnavError(f"{stage.folder}: {stage.name} {reason}, and {reader.name} needs it; run `{command}`")
+        return ""
+    if changed := "; ".join(records.differences(stage)):
+        return f"was made with other settings ({changed})"
+    if stage.record.exists():
+        return "is unfinished, or something that it was made from has changed since"
+    return "is missing"
 
 
 def with_all_above(stages: Iterable[Stage]) -> list[Stage]:
@@ -90,6 +96,17 @@ def waves(stages: Iterable[Stage]) -> list[list[Stage]]:
     return groups
 
 
+def prepare(stages: Iterable[Stage]) -> None:
+    """Makes sure that what stages will write can be written, which is better known before the first one than after it.
+
+    Raises:
+        RomnavError: A file cannot be written.
+    """
+    for stage in stages:
+        for path in (*(stage.folder / name for name in stage.outputs), stage.record):
+            files.prepare(path)
+
+
 def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None] = lambda line: None) -> None:
     """Runs stages one after the other; what is finished stays finished when a later one fails.
 
@@ -105,13 +122,28 @@ def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None
     for stage in stages:
         changed = "; ".join(records.differences(stage))
         say(f"{stage.name} (changed: {changed})" if changed else stage.name)
-        started = time.monotonic()
         try:
-            record = records.begin(stage, session.resume)
-            with bar(stage.name) as progress:
-                facts = stage.make(stage, session, progress)
+            with held(
+                stage.record.with_name(f".{stage.record.name}.lock"), partial(_tell_of_waiting, stage, say)
+            ) as late:
+                there = records.retrieve(stage) or late
+                if there and session.resume and records.finished(stage):
+                    say(f"{stage.name} is there")
+                else:
+                    _make(stage, session)
         except OSError as error:
             if error.errno not in files.HINTS:
                 raise
             raise files.unwritable(Path(error.filename or stage.folder), error) from error
-        records.finish(stage, record, facts, time.monotonic() - started)
+
+
+def _make(stage: Stage, session: Session) -> None:
+    started = time.monotonic()
+    record = records.begin(stage, session.resume)
+    with bar(stage.name) as progress:
+        facts = stage.make(stage, session, progress)
+    records.finish(stage, record, facts, time.monotonic() - started)
+
+
+def _tell_of_waiting(stage: Stage, say: Callable[[str], None], holder: str) -> None:
+    say(f"{stage.name}: waiting for {holder}, which makes it")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,6 +33,8 @@ class Session:
     def __post_init__(self) -> None:
         if self.device == "cpu":
             return
+        if not re.fullmatch(r"cuda(:\d+)?", self.device):
+            raise RomnavError(f"device {self.device}: there is none of this name; use cpu, cuda or cuda:N")
         import torch
 
         try:
@@ -61,12 +64,16 @@ class Stage:
     """Dotted names of the settings that its output depends on."""
     make: Callable[[Stage, Session, Progress], dict[str, Any]] = field(compare=False)
     """Makes the output and returns facts worth recording, e.g. its training steps."""
+    code: tuple[str, ...] = ()
+    """Parts from outside that make its output beside those in its settings, with the digests of their source."""
     reads: tuple[Path, ...] = ()
     """Versioned files that its output depends on."""
     upstream: tuple[Stage, ...] = ()
     """Stages whose output it reads."""
     scratch: tuple[str, ...] = ()
-    """Files from which an interrupted run continues; useless once a setting has changed."""
+    """Files from which an interrupted run continues; gone once it is finished."""
+    beside: tuple[str, ...] = ()
+    """Other files and folders of the same run, which go where its scratch goes."""
     command: tuple[str, ...] = ()
     """Words after ``romnav`` that make it alone, if there is such a command."""
     on_request: bool = False
@@ -79,8 +86,9 @@ class Stage:
     @cached_property
     def spec(self) -> dict[str, Any]:
         """Everything that determines the output beside the upstream stages, as plain data."""
-        used = {name: attrgetter(name)(self.settings) for name in self.uses}
-        plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in used.items()}
+        plain = {name: _plain(self.settings, name) for name in self.uses}
+        if self.code:
+            plain["code"] = self.code
         read = {path.name: digest(path) if path.exists() else None for path in self.reads}
         # through JSON, as the record is: a tuple there is a list
         data: dict[str, Any] = json.loads(json.dumps({"arm": self.arm, "seed": self.seed, **plain, **read}))
@@ -91,6 +99,15 @@ class Stage:
         """Hash of the specification and of every upstream key."""
         text = json.dumps([self.kind, self.spec, [stage.key for stage in self.upstream]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(settings: Config, name: str) -> Any:
+    """A setting as it is saved."""
+    above, _, last = name.rpartition(".")
+    section = attrgetter(above)(settings) if above else settings
+    if last in type(section).model_fields:
+        return section.model_dump(mode="json", include={last}).get(last)
+    return getattr(section, last)
 
 
 def digest(path: Path) -> str:

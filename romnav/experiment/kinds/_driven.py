@@ -12,7 +12,7 @@ from romnav.experiment.graph.stage import Stage, digest
 from romnav.experiment.kinds.locomotion import walking
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.scales import Scale
-from romnav.experiment.spec import SCRIPTED
+from romnav.experiment.spec import DRIVERS, SCRIPTED
 from romnav.experiment.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -40,10 +40,10 @@ class Driven:
     @classmethod
     def by(cls, work: Workspace, arm: str, seed: int) -> Driven:
         """The arm as it drives: its own policy or script, or another arm's on a body of its own."""
-        driver = work.project.driver(arm)
-        trained = None if driver in SCRIPTED else policy(work, arm, seed)
+        driver, script = work.project.driver(arm), work.project.script(arm)
+        trained = None if script else policy(work, arm, seed)
         settings = work.arm_settings(driver) if trained else work.settings
-        if driver != arm:
+        if arm not in SCRIPTED and (script or driver != arm):
             settings = settings.on_body(work.arm_settings(arm).navigation.dynamics)
         return cls(work, arm, seed if trained else 0, trained, settings)
 
@@ -53,6 +53,12 @@ class Driven:
         if self.policy is None:
             return "navigation.dynamics", "navigation.env"
         return ("navigation.dynamics",) if self.policy.arm != self.arm else ()
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The script, if it is from outside."""
+        script = self.work.project.script(self.arm)
+        return (DRIVERS.stamped(script),) if script and script not in SCRIPTED else ()
 
     @property
     def upstream(self) -> tuple[Stage, ...]:
@@ -72,7 +78,9 @@ class Driven:
         from romnav.navigation import checkpoint
 
         if self.policy is None:
-            return rollout.SCRIPTED[self.work.project.driver(self.arm)]()
+            script = str(self.work.project.script(self.arm))
+            made: Driver = rollout.SCRIPTED[script]() if script in SCRIPTED else DRIVERS.load(script)
+            return made
         seen = perception(self.work, self.policy, self.settings, world, noise=NOISE, device=device)
         depth = seen.depth.encoder if seen.depth else None
         path = self.policy.folder / "policy.pt"

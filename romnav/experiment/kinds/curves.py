@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from romnav.errors import NothingRecorded
@@ -21,44 +20,46 @@ if TYPE_CHECKING:
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
-    """The learning curves of an experiment, if it draws them."""
-    experiment = work.project.experiment(name)
-    if not experiment.curves:
-        return []
+    """The learning curves of an experiment, if it draws them.
+
+    Raises:
+        RomnavError: Its arms are invalid, or there are no such published results.
+    """
+    declared = work.project.experiment(name).declared(name, {"curves"})
     return [
         Stage(
             kind="curves",
-            name=f"curves {name}",
+            name=f"curves {table}",
             folder=work.folder,
-            outputs=(f"figures/{name}.png", *(f"tables/{name}.{format}" for format in ("tex", "md", "csv"))),
-            record=work.folder / "figures" / f"{name}.json",
-            settings=experiment,
-            uses=("title", "labels"),
-            make=partial(_draw, work, experiment),
+            outputs=(f"figures/{table}.png", *(f"tables/{table}.{format}" for format in ("tex", "md", "csv"))),
+            record=work.folder / "figures" / f"{table}.json",
+            settings=declared,
+            uses=("title", "labels", "tables"),
+            make=partial(_draw, work, name, table),
+            reads=work.project.published_files(name),
             upstream=policies(work, name, seeds),
         )
+        for table in declared.tables
     ]
 
 
-def _draw(
-    work: Workspace, experiment: Experiment, stage: Stage, session: Session, progress: Progress
-) -> dict[str, Any]:
+def _draw(work: Workspace, name: str, table: str, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
     """Of the arms and training seeds that are there."""
     from romnav.report import curves, formats
 
-    name, runs = Path(stage.outputs[0]).stem, finished(stage.upstream)
+    runs = finished(stage.upstream)
     if not runs:
         raise NothingRecorded(f"{stage.folder}: no arm of {name} is trained; run `romnav run ablation {name}`")
-    arms = read(work, experiment, runs)
+    arms = read(work, work.project.experiment(name), runs)
     curves.draw(arms, stage.folder / stage.outputs[0])
-    formats.write(tabulate(work, name, arms, runs), stage.folder / "tables")
+    formats.write(tabulate(work, name, table, arms, runs), stage.folder / "tables")
     return {}
 
 
 def policies(work: Workspace, name: str, seeds: Sequence[int]) -> tuple[Stage, ...]:
     """The training runs of an experiment."""
     arms = work.project.experiment(name).arms.items()
-    return tuple(policy(work, arm, seed) for arm, spec in arms if not spec.policy for seed in seeds)
+    return tuple(policy(work, arm, seed) for arm, spec in arms if spec.trained for seed in seeds)
 
 
 def finished(runs: Sequence[Stage]) -> list[Stage]:
@@ -81,14 +82,16 @@ def read(work: Workspace, experiment: Experiment, runs: Sequence[Stage]) -> dict
     return arms
 
 
-def tabulate(work: Workspace, name: str, arms: Mapping[str, Curves], runs: Sequence[Stage]) -> Table:
-    """The table of the arms of finished training runs."""
+def tabulate(work: Workspace, name: str, table: str, arms: Mapping[str, Curves], runs: Sequence[Stage]) -> Table:
+    """A declared table of the arms of finished training runs."""
     from romnav.report import curves
 
+    experiment = work.project.experiment(name)
     made = [record.provenance["commit"][:12] for run in runs if (record := records.read(run))]
     provenance = {"scale": work.scale, "commit": ", ".join(sorted(set(made)))}
     sources = {arm: tuple(_source(run) for run in runs if run.arm == arm) for arm in arms}
-    return curves.tabulate(name, work.project.experiment(name).title, arms, provenance, sources)
+    caption = experiment.tables[table].caption or f"{experiment.title}."
+    return curves.tabulate(table, caption, arms, provenance, sources, work.project.published(name))
 
 
 def _source(run: Stage) -> dict[str, Any]:

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from romnav.errors import RomnavError
+from romnav.experiment.graph.run import missing
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.locomotion import body
+from romnav.experiment.kinds.policy import policy
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -33,11 +35,28 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(paired_set(work),),
+        code=driven.code,
         upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
         seed=driven.seed,
     )
+
+
+def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
+    """The episodes of every arm and training seed whose own policy is finished, and why others that were begun are not
+    among them."""
+    stages, left_out = [], []
+    experiments = work.project.experiments.values()
+    arms = (name for experiment in experiments for name, arm in experiment.arms.items() if arm.trained)
+    for arm in dict.fromkeys(arms):
+        for seed in work.project.seeds(arm):
+            trained = policy(work, arm, seed)
+            if not (reason := missing(trained)):
+                stages.append(episodes(work, arm, seed))
+            elif trained.record.exists():
+                left_out.append(f"{trained.name} {reason}")
+    return stages, left_out
 
 
 def paired_set(work: Workspace) -> Path:

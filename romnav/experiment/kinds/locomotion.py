@@ -12,6 +12,7 @@ from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.scales import Scale
 from romnav.experiment.workspace import Workspace
+from romnav.navigation.spec import BODIES
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
@@ -110,9 +111,14 @@ def body(work: Workspace, settings: Scale, seed: int, device: str, threads: int)
     """
     from romnav.robot.rom import ReducedOrderModel
 
-    if settings.navigation.dynamics == "rom":
-        return ReducedOrderModel
-    return humanoid(work, seed, device, threads)
+    match settings.navigation.dynamics:
+        case "rom":
+            return ReducedOrderModel
+        case "g1":
+            return humanoid(work, seed, device, threads)
+        case outside:
+            made: Body = BODIES.load(outside)
+            return made
 
 
 def humanoid(work: Workspace, seed: int, device: str, threads: int) -> Callable[[World, int, float], Humanoid]:

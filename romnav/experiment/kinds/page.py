@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from romnav.errors import NothingRecorded, RomnavError
-from romnav.experiment.kinds import curves, trials
+from romnav.experiment.kinds import curves, tables, trials
 from romnav.experiment.kinds.episodes import look_at
 from romnav.experiment.spec import SCRIPTED
 from romnav.experiment.workspace import Workspace
@@ -30,25 +30,23 @@ def write(work: Workspace, arms: Sequence[str], path: Path) -> list[str]:
     from romnav.report.page.render import Report, write
 
     notes: list[str] = []
-    tables = [*_paired(work, notes), *_trials(work)]
+    shown = [*_paired(work, notes), *_trials(work)]
     learnt = _curves(work, notes)
-    tables += [table for experiment in learnt.values() for table in experiment[1]]
+    shown += [table for experiment in learnt.values() for table in experiment[1]]
     galleries = _galleries(work, arms, notes)
     drawn = {title: runs for title, (runs, _) in learnt.items()}
-    if not (tables or galleries or drawn):
+    if not (shown or galleries or drawn):
         raise NothingRecorded(
             f"{work.folder}: nothing is recorded; run `romnav run ablation spawn-goal --scale {work.scale}`"
         )
     notes = [note.replace(f"{work.project.root}/", "") for note in notes]
-    write(Report(work.scale, tables, drawn, galleries, notes), path)
+    write(Report(work.scale, shown, drawn, galleries, notes), path)
     return notes
 
 
 def _paired(work: Workspace, notes: list[str]) -> list[Table]:
-    from romnav.report.paired import results, tables
-
     try:
-        return tables.build_all(results.load(work.project.results, work.scale))
+        return tables.evaluated(work)
     except RomnavError as error:
         notes.append(f"no tables of episodes: {error}")
         return []
@@ -56,8 +54,12 @@ def _paired(work: Workspace, notes: list[str]) -> list[Table]:
 
 def _trials(work: Workspace) -> list[Table]:
     experiments = work.project.experiments.items()
-    reports = [(name, e, stage) for name, e in experiments for stage in trials.reports(work, name, e.seeds)]
-    return [trials.tabulate(name, e, runs) for name, e, stage in reports if (runs := trials.recorded(stage))]
+    reports = [(name, stage) for name, e in experiments for stage in trials.reports(work, name, e.seeds)]
+    return [
+        trials.tabulate(work, name, Path(stage.outputs[0]).stem, runs)
+        for name, stage in reports
+        if (runs := trials.recorded(stage))
+    ]
 
 
 def _curves(work: Workspace, notes: list[str]) -> dict[str, tuple[list[Curves], list[Table]]]:
@@ -76,12 +78,13 @@ def _curves(work: Workspace, notes: list[str]) -> dict[str, tuple[list[Curves], 
         try:
             arms = curves.read(work, experiment, runs)
             ended = curves.read(work, experiment, done)
-            tables = [curves.tabulate(work, name, ended, done)] if experiment.curves and done else []
+            drawn = experiment.declared(name, {"curves"}).tables if done else ()
+            made = [curves.tabulate(work, name, table, ended, done) for table in drawn]
         except RomnavError as error:
             notes.append(f"no learning curves of {name}: {error}")
             continue
         shown |= {run.name for run in runs}
-        found[experiment.title] = (list(arms.values()), tables)
+        found[experiment.title] = (list(arms.values()), made)
     return found
 
 

@@ -15,7 +15,10 @@ from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from romnav.navigation.perception import Eye, Perception
+    from romnav.sensing.encoder import Encoder
     from romnav.world.world import World
 
 DEPTH_NOISE = 1_000_003
@@ -50,7 +53,8 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         uses=tuple(uses),
         make=partial(_train, work, settings),
         upstream=(*encoders.values(), *teacher, *walking(work, settings)),
-        scratch=("checkpoint.pt", "curve.csv", "kept.csv"),
+        scratch=("checkpoint.pt",),
+        beside=("curve.csv", "kept", "kept.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
         arm=arm,
         seed=seed,
@@ -60,7 +64,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
 def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
     project = work.project
     key = f"{project.file(project.having(arm)[0])}: arms.{arm}.kickstart.teacher"
-    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if not spec.policy}
+    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if spec.trained}
     if teacher not in trained:
         raise RomnavError(f"{key}: no arm {teacher} that is trained{suggest(teacher, trained)}")
     if work.arm_settings(teacher).kickstart:
@@ -117,13 +121,37 @@ def perception(
     pretrained = _encoders(work, work.arm_settings(str(trained.arm)))
     noises = {"lidar": noise, "depth": noise + DEPTH_NOISE}
     eyes = {
-        sensor: _eye(work, settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
+        sensor: eye(work, settings, sensor, pretrained.get(sensor), trained.seed or 0, world, noises[sensor], device)
         for sensor in ("lidar", *(pretrained.keys() - {"lidar"}))
     }
     return Perception(**eyes)
 
 
-def _eye(
+def frozen_encoders(work: Workspace, trained: Stage) -> tuple[Encoder, Encoder | None]:
+    """Encoders of the LiDAR and, if it has one, the depth camera of a policy, as its training began with them."""
+    from romnav.sensing.image import directions
+
+    settings = work.arm_settings(str(trained.arm))
+    pretrained = _encoders(work, settings)
+    rays = directions(settings.lidar)
+    lidar = _encoder(settings, "lidar", pretrained.get("lidar"), trained.seed or 0, rays, "cpu")
+    depth = _encoder(settings, "depth", pretrained["depth"], 0, rays, "cpu") if "depth" in pretrained else None
+    return lidar, depth
+
+
+def _encoder(
+    settings: Scale, sensor: str, pretrained: Stage | None, seed: int, directions: Tensor, device: str
+) -> Encoder:
+    """The pretrained encoder of a sensor, or the random one that the training with ``seed`` began with."""
+    from romnav.sensing import encoder as encoders
+
+    spec = getattr(settings, SENSORS[sensor]).encoder
+    if pretrained:
+        return encoders.load(pretrained.folder / "encoder.pt", spec, device)
+    return encoders.untrained(spec, directions, seed).encoder.to(device).requires_grad_(False)
+
+
+def eye(
     work: Workspace,
     settings: Scale,
     sensor: str,
@@ -133,22 +161,18 @@ def _eye(
     noise: int,
     device: str,
 ) -> Eye:
-    """A sensor with its pretrained encoder, or the random one that the training with ``seed`` began with."""
+    """A sensor and its encoder."""
     from romnav.navigation.perception import Eye
     from romnav.robot.arms import OwnArms
-    from romnav.sensing import encoder as encoders
     from romnav.sensing.corruption import Corruption
 
     navigation, pretraining = settings.navigation, getattr(settings, SENSORS[sensor])
     scanner = make_sensor(work, settings, sensor, world.tiles, device)
-    if pretrained:
-        made = encoders.load(pretrained.folder / "encoder.pt", pretraining.encoder, device)
-    else:
-        made = encoders.untrained(pretraining.encoder, scanner.directions, seed).encoder.to(device)
+    made = _encoder(settings, sensor, pretrained, seed, scanner.directions, device)
     # a running sensor loses far fewer pixels than pretraining drops, a camera as a LiDAR
     depth = pretraining.corruption.model_copy(update={"dropout": navigation.corruption.dropout})
     corruption = Corruption(navigation.corruption if sensor == "lidar" else depth, noise, device)
     arms = None
     if navigation.dynamics == "g1":
         arms = OwnArms(settings.locomotion.robot, scanner.directions, levelled=sensor == "lidar", device=device)
-    return Eye(scanner, corruption, made.requires_grad_(False), arms)
+    return Eye(scanner, corruption, made, arms)

@@ -3,31 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from romnav.errors import RomnavError
+from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.episodes import episodes
-from romnav.experiment.spec import SCRIPTED, suggest
+from romnav.experiment.spec import SCRIPTED, Declared, suggest
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
+from romnav.report.spec import PAIRED
+
+if TYPE_CHECKING:
+    from romnav.report.formats import Table
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
     """The tables of an experiment, if it has any.
 
     Raises:
-        RomnavError: There is no such experiment or table, or its arms are invalid.
+        RomnavError: There is no such experiment, metric or file of published results, or its arms are invalid.
     """
-    from romnav.report.paired.tables import SPECS
+    from romnav.report.paired.tables import known_metrics
 
     experiment = work.project.experiment(name)
-    known = {spec.name for spec in SPECS}
-    for table in experiment.tables:
-        if table not in known:
-            raise RomnavError(f"{work.project.file(name)}: tables: unknown table {table}{suggest(table, known)}")
-    if not experiment.tables:
+    declared = experiment.declared(name, PAIRED)
+    for table, spec in declared.tables.items():
+        known = known_metrics(spec.kind)
+        for column in spec.columns:
+            if column.metric not in known:
+                raise RomnavError(
+                    f"{work.project.file(name)}: tables.{table}.columns: unknown metric {column.metric}"
+                    f"{suggest(column.metric, known)}, see `romnav list metrics`"
+                )
+    if not declared.tables:
         return []
     arms = [(arm, seed) for arm in experiment.arms for seed in seeds]
     return [
@@ -35,27 +45,50 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             kind="tables",
             name=f"tables {name}",
             folder=work.folder / "tables",
-            outputs=tuple(f"{table}.{format}" for table in experiment.tables for format in ("tex", "md", "csv")),
+            outputs=tuple(f"{table}.{format}" for table in declared.tables for format in ("tex", "md", "csv")),
             record=work.folder / "tables" / f"{name}.json",
-            settings=experiment,
-            uses=("tables",),
-            make=partial(_write, work, experiment.tables),
+            settings=declared,
+            uses=("title", "labels", "tables"),
+            make=partial(_write, work, name, declared),
+            reads=work.project.published_files(name),
             upstream=tuple(episodes(work, arm, seed) for arm, seed in [*arms, *((arm, 0) for arm in SCRIPTED)]),
         )
     ]
 
 
-def _write(work: Workspace, names: Sequence[str], stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+def _write(
+    work: Workspace, name: str, declared: Declared, stage: Stage, session: Session, progress: Progress
+) -> dict[str, Any]:
     from romnav.evaluation.paired.statistics import Bootstrap
     from romnav.report import formats
     from romnav.report.paired import results, tables
 
-    bootstrap = Bootstrap(results.load(work.project.results, work.scale))
-    specs = {spec.name: spec for spec in tables.SPECS}
+    bootstrap, published = Bootstrap(results.load(work.project.results, work.scale)), work.project.published(name)
     built = []
-    for name in names:
-        built.append(tables.build(specs[name], bootstrap))
-        progress(len(built), len(names), name)
-    for table in built:  # all or none
-        formats.write(table, stage.folder)
+    for table, spec in declared.tables.items():
+        built.append(tables.build(table, spec, declared.title, bootstrap, published))
+        progress(len(built), len(declared.tables), table)
+    for made in built:  # all or none
+        formats.write(made, stage.folder)
     return {}
+
+
+def evaluated(work: Workspace) -> list[Table]:
+    """Every declared table of which at least two arms were evaluated.
+
+    Raises:
+        RomnavError: None was, or rows are unreadable or cannot be compared.
+    """
+    from romnav.evaluation.paired.statistics import Bootstrap
+    from romnav.report.paired import results, tables
+
+    bootstrap = Bootstrap(results.load(work.project.results, work.scale))
+    built = []
+    for name, experiment in work.project.experiments.items():
+        declared, published = experiment.declared(name, PAIRED), work.project.published(name)
+        for table, spec in declared.tables.items():
+            if len(tables.evaluated(spec, bootstrap)) < 2:
+                continue
+            with suppress(NothingRecorded):  # bounds alone
+                built.append(tables.build(table, spec, declared.title, bootstrap, published))
+    return built

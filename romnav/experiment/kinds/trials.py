@@ -13,7 +13,7 @@ from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.locomotion import humanoid
-from romnav.experiment.spec import SCRIPTED, Experiment, TrialKind
+from romnav.experiment.spec import SCRIPTED, TrialKind
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -40,6 +40,11 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
             f"reduced-order model with a body; name {driver} in its place"
         )
     driven = Driven.by(work, arm, seed)
+    if driven.settings.navigation.dynamics not in ("rom", "g1"):
+        raise RomnavError(
+            f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.navigation.dynamics: trials need a body "
+            "that touches the solids themselves; set rom or g1"
+        )
     return Stage(
         kind="trials",
         name=f"{kind} {arm}, seed {driven.seed}",
@@ -50,6 +55,7 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
         uses=(kind, *driven.uses),
         make=partial(_run, driven, kind),
         reads=SCENES,
+        code=driven.code,
         upstream=driven.upstream,
         arm=arm,
         seed=driven.seed,
@@ -89,34 +95,37 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
     rolls = any(work.arm_settings(arm).navigation.dynamics == "rom" for arm in experiment.arms)
     bounds = [(arm, 0) for arm in SCRIPTED if rolls]
     arms = [*((arm, seed) for arm in experiment.arms for seed in seeds), *bounds]
+    declared = experiment.declared(name, {"trials"})
     return [
         Stage(
             kind="report",
-            name=f"report {name}",
+            name=f"report {table}",
             folder=work.folder,
-            outputs=(*(f"tables/{name}.{format}" for format in ("tex", "md", "csv")), f"figures/{name}.png"),
-            record=work.folder / "tables" / f"{name}.json",
-            settings=experiment,
-            uses=("labels",),
-            make=partial(_report, name, experiment, kind),
+            outputs=(*(f"tables/{table}.{format}" for format in ("tex", "md", "csv")), f"figures/{table}.png"),
+            record=work.folder / "tables" / f"{table}.json",
+            settings=declared,
+            uses=("labels", "tables"),
+            make=partial(_report, work, name, table),
+            reads=work.project.published_files(name),
             upstream=tuple(trials(work, kind, arm, seed) for arm, seed in arms),
         )
+        for table in declared.tables
     ]
 
 
 def _report(
-    name: str, experiment: Experiment, kind: TrialKind, stage: Stage, session: Session, progress: Progress
+    work: Workspace, name: str, table: str, stage: Stage, session: Session, progress: Progress
 ) -> dict[str, Any]:
     """Of the arms that have been driven."""
     from romnav.report import formats
     from romnav.report.trials import pictures
 
-    runs = recorded(stage)
+    kind, runs = cast(TrialKind, work.project.experiment(name).kind), recorded(stage)
     if not runs:
         missing = stage.upstream[0].folder / stage.upstream[0].outputs[0]
         raise NothingRecorded(f"{missing}: no trials yet; run `romnav run {' '.join({kind: 0, name: 0})}`")
     draw = {"safety": pictures.draw_safety, "deploy": pictures.draw_deployments}[kind]
-    formats.write(tabulate(name, experiment, runs), stage.folder / "tables")
+    formats.write(tabulate(work, name, table, runs), stage.folder / "tables")
     draw(runs[0], _scenes(kind), stage.folder / stage.outputs[-1])
     return {}
 
@@ -129,13 +138,14 @@ def recorded(report: Stage) -> list[TrialRows]:
     return [rows.read(file) for file in files if file.exists()]
 
 
-def tabulate(name: str, experiment: Experiment, runs: Sequence[TrialRows]) -> Table:
-    """The table of an experiment that consists of trials."""
+def tabulate(work: Workspace, name: str, table: str, runs: Sequence[TrialRows]) -> Table:
+    """A declared table of an experiment that consists of trials."""
     from romnav.report.trials import tables
 
+    experiment = work.project.experiment(name)
     kind = cast(TrialKind, experiment.kind)
     build = {"safety": tables.safety, "deploy": tables.deploy}[kind]
-    return replace(build(runs, _scenes(kind), experiment.labels), name=name)
+    return replace(build(runs, _scenes(kind), experiment.labels, work.project.published(name)), name=table)
 
 
 def _scenes(kind: TrialKind) -> tuple[Scene, ...]:

@@ -10,6 +10,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from romnav.report.formats import literal
+
 COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b")
 PANELS = (
     ("steps", "sr_120_same", "same level, 120 s"),
@@ -39,7 +41,7 @@ def draw(arms: Mapping[str, pd.DataFrame], path: Path) -> None:
             gain = slope(rows["steps"], rows[column])
             told = label if np.isnan(gain) else f"{label} ({gain:+.1f} a doubling)"
             x = rows["steps"] / 1e6 if over == "steps" else rows[over]
-            panel.plot(x, rows[column], color=colour, marker="o", markersize=3, label=told)
+            panel.plot(x, rows[column], color=colour, marker="o", markersize=3, label=literal(told))
         panel.set_title(title, fontsize=9)
         _finish(panel, "million steps" if over == "steps" else "hours of training")
     axes[0].set_ylabel("success on the episodes for choices (%)")

@@ -21,7 +21,8 @@ def load(results_dir: Path, scale: str) -> list[rows.Arm]:
         RomnavError: There are none, one is unreadable, or they cannot be compared.
     """
     folder = results_dir / scale
-    files = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
+    found = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
+    files = [file for file in found if file.parts[-2].removeprefix("seed-").isdecimal()]
     if not files:
         raise NothingRecorded(
             f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`"
@@ -41,16 +42,18 @@ def collect(results_dir: Path, scale: str) -> dict[str, Any]:
     """What ``romnav results --json`` prints: metrics per arm and training seed, contrasts per ordered pair.
 
     Rates and differences are in percent, times in s, training in environment steps and hours; a value that
-    does not exist (time to goal without a success) is None. Contrasts pool the training seeds of an arm.
+    does not exist (time to goal without a success) is None. Contrasts pool the training seeds of an arm; their interval
+    is over episodes, and over tiles (tile_lo, tile_hi), whose episodes are alike; a_only and b_only count the episodes
+    that one of two runs solves, mid_p is McNemar's.
     """
     arms = load(results_dir, scale)
-    bootstrap = Bootstrap(arms)
+    bootstrap, by_tile = Bootstrap(arms), Bootstrap(arms, cluster="tile")
     return {
         "scale": scale,
         "episode_set": arms[0].runs[0].provenance.episode_set,
         "arms": [_arm(run) for arm in arms for run in arm.runs],
         "contrasts": [
-            _contrast(bootstrap, a.name, b.name, horizon, level)
+            _contrast(bootstrap, by_tile, a.name, b.name, horizon, level)
             for a, b in permutations(arms, 2)
             for horizon in rows.HORIZONS
             for level in metrics.LEVELS
@@ -78,8 +81,10 @@ def _arm(run: rows.EpisodeRows) -> dict[str, Any]:
     }
 
 
-def _contrast(bootstrap: Bootstrap, a: str, b: str, horizon: int, level: metrics.Level) -> dict[str, Any]:
-    contrast = bootstrap.contrast(a, b, horizon, level)
+def _contrast(
+    bootstrap: Bootstrap, by_tile: Bootstrap, a: str, b: str, horizon: int, level: metrics.Level
+) -> dict[str, Any]:
+    contrast, coarse = (draws.contrast(a, b, f"sr_{horizon}", level) for draws in (bootstrap, by_tile))
     return {
         "a": a,
         "b": b,
@@ -87,6 +92,11 @@ def _contrast(bootstrap: Bootstrap, a: str, b: str, horizon: int, level: metrics
         "level": level,
         **{name: _or_none(getattr(contrast, name)) for name in ("diff", "lo", "hi")},
         "n": contrast.n,
+        "tile_lo": _or_none(coarse.lo),
+        "tile_hi": _or_none(coarse.hi),
+        "a_only": contrast.a_only,
+        "b_only": contrast.b_only,
+        "mid_p": contrast.mid_p,
     }
 
 

@@ -16,9 +16,9 @@ from romnav.evaluation.trials.statistics import (
     held_trials,
     summarise,
 )
-from romnav.report import paper
 from romnav.report.formats import Block, Cell, Row, Table, number
 from romnav.report.provenance import source, sources, training
+from romnav.report.spec import Published
 from romnav.world.scenes.scene import Scene
 
 SHARED = 10
@@ -27,7 +27,9 @@ ARMS = {False: "no CBF", True: "CBF"}
 SCRIPTED = {"oracle": "Oracle (knows the map)", "straight": "Straight (sees nothing)"}
 
 
-def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[str, str]) -> Table:
+def safety(
+    runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[str, str], published: Published | None = None
+) -> Table:
     """Successes, collisions and time to goal in the obstacle sets; ``labels`` name the trained arms."""
     blocks = []
     for run in runs:
@@ -39,13 +41,16 @@ def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
             differences = (*_dashes(3), *_differences(run, scene.name), *_dashes(1))
             rows.append(Row(f"{scene.label}, CBF − no CBF", differences, _rows(run, "safety")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
-    published = []
-    for scene in scenes:
-        for filtered, arm in ARMS.items():
-            p = paper.SAFETY[scene.name, filtered]
-            cells = (_of(p["successes"], SHARED), _of(p["collisions"], SHARED), _time(p["time"], p["time_std"], 1))
-            published.append(Row(f"{scene.label}, {arm}", (*cells, *_dashes(3))))
-    blocks.append(Block("paper", "Paper (hardware)", tuple(published)))
+    if published and published.safety:
+        rows = []
+        for scene in scenes:
+            for filtered, arm in ARMS.items():
+                p = published.safety.get(scene.name, {}).get("on" if filtered else "off")
+                if p is None:
+                    continue
+                cells = (_of(p.successes, SHARED), _of(p.collisions, SHARED), _time(p.time, p.time_std, 1))
+                rows.append(Row(f"{scene.label}, {arm}", (*cells, *_dashes(3))))
+        blocks.append(Block("paper", f"{published.title} (hardware)", tuple(rows)))
     held = "; ".join(
         f"{_name(run, labels)} "
         + " and ".join(str(sum(len(of(run, scene.name)) for scene in scenes)) for of in (held_trials, closed_routes))
@@ -76,7 +81,9 @@ def safety(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
     )
 
 
-def deploy(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[str, str]) -> Table:
+def deploy(
+    runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[str, str], published: Published | None = None
+) -> Table:
     """Successes, collisions, time and path in the deployments."""
     blocks = []
     for run in runs:
@@ -92,11 +99,13 @@ def deploy(runs: Sequence[TrialRows], scenes: Sequence[Scene], labels: Mapping[s
                 )
                 rows.append(Row(f"{scene.label}, {arm}", (*_rates(s), *last), _rows(run, "deploy")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
-    published = [
-        Row(scene.label, (_of(1, 1), _of(0, 1), number(math.nan, 1), number(length, 0), *_dashes(3)))
-        for scene, length in zip(scenes, paper.DEPLOYMENTS.values(), strict=True)
-    ]
-    blocks.append(Block("paper", "Paper (hardware, one trial each)", tuple(published)))
+    if published and published.deploy:
+        lengths = ((scene.label, published.deploy[scene.name]) for scene in scenes if scene.name in published.deploy)
+        rows = [
+            Row(label, (_of(1, 1), _of(0, 1), number(math.nan, 1), number(length, 0), *_dashes(3)))
+            for label, length in lengths
+        ]
+        blocks.append(Block("paper", f"{published.title} (hardware, one trial each)", tuple(rows)))
     trials = len(runs[0].of(scenes[0].name, False)["trial"])
     caption = (
         f"The four long deployments, {trials} starts each, safety filter (CBF) off and on. Time to goal and path are "

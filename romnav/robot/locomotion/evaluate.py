@@ -103,7 +103,7 @@ def run_row(
     """Run the trials of one row; see `evaluate`."""
     random = torch.Generator().manual_seed(seed)
     ground = Ground(list(row.lanes))
-    robots = Humanoids(spec.robot.model_copy(update={"friction": 0.8}), ground.boxes, trials, threads=threads)
+    robots = Humanoids(spec.robot.model_copy(update={"friction": 0.8}), [ground.geoms], trials, threads=threads)
     control = Controller(spec, robots)
     index = torch.arange(trials)
     lane = index % len(row.lanes)

@@ -79,7 +79,7 @@ def curve(table: Path, path: Path) -> Path:
 def _strip(row: Row, checkpoint: Path, out: Path, seconds: float, frames: int, threads: int) -> Path:
     spec, policy, iteration = load_policy(checkpoint)
     ground = Ground([row.lanes[-1]])
-    robots = Humanoids(spec.robot, ground.boxes, 1, threads=threads)
+    robots = Humanoids(spec.robot, [ground.geoms], 1, threads=threads)
     control = Controller(spec, robots)
     one, lane = torch.zeros(1, dtype=torch.long), torch.zeros(1, dtype=torch.long)
     arc, speed = ground.spawn[:1, 0].clone(), torch.full((1,), 0.5)

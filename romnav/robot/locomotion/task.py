@@ -131,6 +131,14 @@ class Controller:
             getattr(self.walker, name)[ids] = state[name]
         self.action[ids] = state["action"]
 
+    def part(self, ids: Tensor, robots: Robots) -> Controller:
+        """That of robots `ids` (k,) alone, which are `robots` now."""
+        part = Controller(self.spec, robots)
+        for name in Walker.STATE:
+            setattr(part.walker, name, getattr(self.walker, name)[ids])
+        part.action = self.action[ids]
+        return part
+
     def state_dict(self) -> dict[str, Any]:
         """State besides the robots'."""
         return {name: getattr(self.walker, name).clone() for name in Walker.STATE} | {
@@ -431,7 +439,7 @@ class LocomotionEnv(WalkingEnv):
     def __init__(self, spec: LocomotionSpec, lanes: list[Lane], *, threads: int = 0) -> None:
         t, n = spec.task, spec.task.robots
         self.ground = Ground(lanes)
-        robots = Humanoids(spec.robot, self.ground.boxes, n, threads=threads)
+        robots = Humanoids(spec.robot, [self.ground.geoms], n, threads=threads)
         super().__init__(spec, robots, self.ground.map, spec.seed)
         self.kinds = list(t.shares)
         self._by_kind = [[i for i, lane in enumerate(lanes) if lane.kind == kind] for kind in self.kinds]

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from romnav.robot.g1 import Boxes
+from romnav.robot.statics import Geoms
 
 
 class Heights(Protocol):
@@ -166,7 +166,7 @@ class Ground:
     """Lanes side by side: one world, one height map, and the path of each lane.
 
     Attributes:
-        boxes: the geoms.
+        geoms: the lanes, to walk on.
         map: the height map (2 cm cells).
         path: (lanes, points, 2) world, m, padded by repeating the last point.
         arc: (lanes, points) arc length at each point, m.
@@ -211,7 +211,7 @@ class Ground:
                 x = origin[0] + (np.arange(i0, i1) + 0.5) * cell
                 top = s.z0 + (x - s.x0) / (s.x1 - s.x0) * (s.z1 - s.z0)
                 heights[i0:i1, j0:j1] = np.maximum(heights[i0:i1, j0:j1], top[:, None])
-        self.boxes = Boxes(
+        self.geoms = Geoms.boxes(
             np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3), np.array(quat).reshape(-1, 4)
         )
         self.map = HeightMap(

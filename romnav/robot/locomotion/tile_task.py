@@ -7,10 +7,10 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from romnav.robot.g1 import Humanoids, build_spec
+from romnav.robot.g1 import Humanoids
 from romnav.robot.locomotion.task import WalkingEnv, heading_of
 from romnav.robot.spec import LocomotionSpec
-from romnav.robot.tiles import TileGeoms, TileHeights, change_layer
+from romnav.robot.tiles import TileHeights, change_layer, geoms
 from romnav.world.geodesic import UNIT
 from romnav.world.lookup import GeodesicLookup
 from romnav.world.world import LEVEL_GAP, MOUTH_RADIUS, World
@@ -37,12 +37,9 @@ class TileEnv(WalkingEnv):
 
     def __init__(self, spec: LocomotionSpec, world: World, *, threads: int = 0) -> None:
         t, n = spec.tiles, spec.tiles.robots
-        geoms = TileGeoms.of(world.tiles)
-        robots = Humanoids(spec.robot, geoms[0], n, threads=threads)
+        robots = Humanoids(spec.robot, [geoms(tile.solids) for tile in world.tiles], n, threads=threads)
         self.tile = torch.arange(n) % len(world.tiles)
-        used = sorted(set(self.tile.tolist()))
-        models = {k: build_spec(spec.robot, geoms[k]).compile() for k in used}
-        robots.stand_on([models[k] for k in self.tile.tolist()])
+        robots.stand_on(self.tile)
         heights = TileHeights(world.tiles)
         heights.place(self.tile)
         super().__init__(spec, robots, heights, spec.seed + 1)

@@ -18,7 +18,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from romnav import files
+from romnav import files, stopping
 from romnav.errors import RomnavError
 from romnav.progress import Progress
 from romnav.robot.locomotion.task import LocomotionEnv, WalkingEnv
@@ -240,44 +240,46 @@ def train(
     ppo.train_mode()
     obs = env.get_observations()
     begin = mark = time.monotonic()
-    for iteration in range(done + 1, spec.iterations + 1):
-        if spec.tiles.robots and iteration == spec.tiles.begin + 1 and len(env.parts) == 1:
-            env = joined()
-            obs = env.get_observations()
-            ppo.storage = RolloutStorage("rl", env.num_envs, spec.ppo.steps, obs, [env.num_actions])
-        rows: list[dict[str, float]] = []
-        total, clock = 0.0, time.monotonic()
-        with torch.inference_mode():
-            for _ in range(spec.ppo.steps):
-                obs, reward, dones, extras = env.step(ppo.act(obs))
-                ppo.process_env_step(obs, reward, dones, extras)
-                rows.append(extras["log"])
-                total += reward.mean().item()
-            ppo.compute_returns(obs)
-        collected = time.monotonic()
-        try:
-            losses = ppo.update()
-        except (RuntimeError, ValueError) as error:
-            # distributions refuse parameters that are not finite, before any loss is reported
-            _check_finite(path, iteration, {"reward": total}, ppo)
-            raise error
-        losses["kl"] = adapt(ppo, spec.ppo)
-        for name, weight in ppo.actor.named_parameters():
-            average[name].lerp_(weight.detach(), 1.0 - spec.ppo.average)
-        row = _row(rows) | {
-            "iteration": iteration, "steps": spec.steps(iteration),
-            "seconds": spent + time.monotonic() - begin, "collect": collected - clock,
-            "learn": time.monotonic() - collected, "reward": total / spec.ppo.steps,
-            "std": ppo.actor.distribution.std_param.mean().item(), "learning_rate": ppo.learning_rate,
-        } | losses  # fmt: skip
-        _check_finite(path, iteration, row, ppo)
-        curve.append(row)
-        if progress:
-            progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
-        if time.monotonic() - mark > save_every or iteration == spec.iterations:
-            mark = time.monotonic()
-            _write_curve(out / "curve.csv", curve)  # first: a resumed run drops what is there too much
-            _save(path, spec, ppo, average, env, iteration, row["seconds"])
+    with stopping.deferred() as stop:
+        for iteration in range(done + 1, spec.iterations + 1):
+            if spec.tiles.robots and iteration == spec.tiles.begin + 1 and len(env.parts) == 1:
+                env = joined()
+                obs = env.get_observations()
+                ppo.storage = RolloutStorage("rl", env.num_envs, spec.ppo.steps, obs, [env.num_actions])
+            rows: list[dict[str, float]] = []
+            total, clock = 0.0, time.monotonic()
+            with torch.inference_mode():
+                for _ in range(spec.ppo.steps):
+                    obs, reward, dones, extras = env.step(ppo.act(obs))
+                    ppo.process_env_step(obs, reward, dones, extras)
+                    rows.append(extras["log"])
+                    total += reward.mean().item()
+                ppo.compute_returns(obs)
+            collected = time.monotonic()
+            try:
+                losses = ppo.update()
+            except (RuntimeError, ValueError) as error:
+                # distributions refuse parameters that are not finite, before any loss is reported
+                _check_finite(path, iteration, {"reward": total}, ppo)
+                raise error
+            losses["kl"] = adapt(ppo, spec.ppo)
+            for name, weight in ppo.actor.named_parameters():
+                average[name].lerp_(weight.detach(), 1.0 - spec.ppo.average)
+            row = _row(rows) | {
+                "iteration": iteration, "steps": spec.steps(iteration),
+                "seconds": spent + time.monotonic() - begin, "collect": collected - clock,
+                "learn": time.monotonic() - collected, "reward": total / spec.ppo.steps,
+                "std": ppo.actor.distribution.std_param.mean().item(), "learning_rate": ppo.learning_rate,
+            } | losses  # fmt: skip
+            _check_finite(path, iteration, row, ppo)
+            curve.append(row)
+            if progress:
+                progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
+            if stop or time.monotonic() - mark > save_every or iteration == spec.iterations:
+                mark = time.monotonic()
+                _write_curve(out / "curve.csv", curve)  # first: a resumed run drops what is there too much
+                _save(path, spec, ppo, average, env, iteration, row["seconds"])
+            stop.obey()
     return path
 
 

@@ -9,13 +9,13 @@ import numpy as np
 
 from romnav.errors import RomnavError
 from romnav.world.grids import Grids, rasterise
-from romnav.world.spec import WorldSpec
+from romnav.world.spec import TILES, WorldSpec
 from romnav.world.tile import Tile, TileClass
 from romnav.world.tiles.building import building
 from romnav.world.tiles.outdoor import outdoor
 from romnav.world.tiles.room import room
 
-GENERATORS: dict[TileClass, Callable[[np.random.Generator, WorldSpec, int], Tile]] = {
+GENERATORS: dict[str, Callable[[np.random.Generator, WorldSpec, int], Tile]] = {
     TileClass.BUILDING: building,
     TileClass.OUTDOOR: outdoor,
     TileClass.ROOM: room,
@@ -33,15 +33,18 @@ def generate(spec: WorldSpec, index: int) -> tuple[Tile, Grids]:
     Raises:
         RomnavError: No draw passes (an impossible spec).
     """
-    kind = TileClass(spec.classes[index % len(spec.classes)])
+    kind = spec.classes[index % len(spec.classes)]
+    generator = GENERATORS.get(kind) or TILES.load(kind)
     why = None
     for attempt in range(MAX_ATTEMPTS):
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([spec.seed, index, attempt])))
-        tile = GENERATORS[kind](rng, spec, index)
+        tile = generator(rng, spec, index)
+        if not isinstance(tile, Tile):
+            raise RomnavError(f"tile class {kind}: makes a {type(tile).__name__}, not a romnav.world.tile.Tile")
         grids = rasterise(tile, spec.grid)
         why = fault(tile, grids)
         if why is None:
-            return replace(tile, draws=attempt + 1), grids
+            return replace(tile, kind=kind, draws=attempt + 1), grids
     raise RomnavError(
         f"world: no {kind} tile passed the reachability check in {MAX_ATTEMPTS} draws "
         f"(seed {spec.seed}, index {index}; {why}); widen world.side or steepen the riser and tread ranges"

@@ -55,7 +55,7 @@ def test_rows_are_put_in_order_of_the_episodes(episode_rows) -> None:
     ("column", "value", "message"),
     [
         ("level", "upper", "impossible level"),
-        ("tile_class", "cave", "impossible tile_class"),
+        ("tile_class", "", "impossible tile_class"),
         ("outcome", "crash", "impossible outcome"),
         ("success_time", 121.0, "impossible success_time"),
         ("geodesic", np.inf, "impossible geodesic"),

@@ -56,20 +56,20 @@ def test_contrast_intervals_agree_with_scipy(bootstrap, arms, level) -> None:
     mask = metrics.in_level(a, level)
     diff = 100 * ((a["success_time"] <= 120).astype(float) - (b["success_time"] <= 120))[mask]
     theirs = np.array([scipy_interval(diff[None], lambda x, axis: x.mean(axis), seed) for seed in range(3)])
-    ours = bootstrap.contrast("rom", "uniform", 120, level)
+    ours = bootstrap.contrast("rom", "uniform", "sr_120", level)
     assert (ours.diff, ours.n) == (pytest.approx(diff.mean()), mask.sum())
     np.testing.assert_allclose([ours.lo, ours.hi], theirs.mean(axis=0), atol=0.04 * (ours.hi - ours.lo))
     assert ours.significant == bool(theirs[0, 0] > 0)
 
 
 def test_an_arm_does_not_differ_from_itself(bootstrap) -> None:
-    c = bootstrap.contrast("rom", "rom", 45)
+    c = bootstrap.contrast("rom", "rom", "sr_45")
     assert (c.diff, c.lo, c.hi, c.significant, c.mid_p) == (0, 0, 0, False, 1)
 
 
 @pytest.mark.parametrize("level", ["all", "same", "cross"])
 def test_contrasts_are_antisymmetric(bootstrap, level) -> None:
-    ab, ba = bootstrap.contrast("rom", "nocap", 120, level), bootstrap.contrast("nocap", "rom", 120, level)
+    ab, ba = bootstrap.contrast("rom", "nocap", "sr_120", level), bootstrap.contrast("nocap", "rom", "sr_120", level)
     assert (ab.diff, ab.lo, ab.hi) == pytest.approx((-ba.diff, -ba.hi, -ba.lo))
     assert (ab.a_only, ab.b_only, ab.mid_p, ab.n) == (ba.b_only, ba.a_only, ba.mid_p, ba.n)
 
@@ -88,7 +88,7 @@ def test_neither_the_order_of_rows_nor_of_arms_matters(bootstrap, arms) -> None:
 
 def test_discordant_episodes_are_counted(bootstrap, arms) -> None:
     a, b = (set(np.flatnonzero(arm.runs[0].columns["success_time"] <= 45)) for arm in arms[:2])
-    c = bootstrap.contrast("rom", "uniform", 45)
+    c = bootstrap.contrast("rom", "uniform", "sr_45")
     assert (c.a_only, c.b_only) == (len(a - b), len(b - a))
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import tempfile
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
-from romnav.experiment.graph.run import execute, pending, require, waves, with_all_above
+from romnav.experiment.graph.run import execute, pending, prepare, require, waves, with_all_above
 from romnav.experiment.graph.stage import Session, Stage
 
 KEYS = "abcdef"
@@ -200,6 +201,97 @@ def test_an_interrupted_stage_resumes_only_its_own_checkpoint(
     assert run([resumable(second)]) == ["a"]
 
 
+def half(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+    """Leaves a checkpoint that names its setting."""
+    (stage.folder / "checkpoint.pt").write_text(str(stage.spec["a"]))
+    raise KeyboardInterrupt
+
+
+def test_a_checkpoint_is_found_again_when_a_setting_is_changed_back(resumable: Callable[[Settings], Stage]) -> None:
+    found = []
+    for a, make in ((0, half), (1, half), (2, half), (1, interrupt), (0, interrupt)):
+        with pytest.raises(KeyboardInterrupt):
+            execute([replace(resumable(Settings(a=a)), make=make)], Session())
+        found.append((resumable(Settings()).folder / "checkpoint.pt").read_text())
+    assert found == ["0", "1", "2", "1+", "0+"]
+
+
+def test_a_finished_run_is_found_again_when_a_setting_is_changed_back(resumable: Callable[[Settings], Stage]) -> None:
+    first, second = resumable(Settings()), resumable(Settings(a=1))
+    assert run([first]) == ["a"]
+    before = (first.folder / "out.txt").read_text()
+    with pytest.raises(KeyboardInterrupt):
+        execute([replace(second, make=interrupt)], Session())
+    assert not (first.folder / "out.txt").exists()
+
+    def work(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        raise AssertionError("ran")
+
+    execute([replace(first, make=work)], Session())
+    assert (first.folder / "out.txt").read_text() == before
+    assert pending([first]) == []
+    with pytest.raises(KeyboardInterrupt):
+        execute([replace(second, make=half)], Session())
+    assert not (first.folder / "replaced" / second.key[:16]).exists()
+
+
+@pytest.mark.parametrize("moves", range(4))
+def test_putting_a_run_aside_can_be_interrupted_anywhere(
+    resumable: Callable[[Settings], Stage], moves: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = (replace(resumable(Settings(a=a)), beside=("curve.csv",)) for a in (0, 1))
+
+    def begun(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        (stage.folder / "curve.csv").write_text("rows")
+        return half(stage, session, progress)
+
+    with pytest.raises(KeyboardInterrupt):
+        execute([replace(first, make=begun)], Session())
+    made, rename = [0], Path.rename
+
+    def breaks(self: Path, target: Path) -> Path:
+        if made[0] == moves:
+            raise KeyboardInterrupt
+        made[0] += 1
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", breaks)
+    with pytest.raises(KeyboardInterrupt):
+        execute([replace(second, make=interrupt)], Session())
+    monkeypatch.undo()
+    with pytest.raises(KeyboardInterrupt):
+        execute([replace(first, make=interrupt)], Session())
+    assert (first.folder / "checkpoint.pt").read_text() == "0+"
+    assert (first.folder / "curve.csv").read_text() == "rows"
+
+
+def test_two_processes_that_need_a_stage_make_it_once(tmp_path: Path) -> None:
+    one = stage(tmp_path, "a", Settings())
+    began, go = threading.Event(), threading.Event()
+
+    def slow(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        began.set()
+        assert go.wait(30)
+        return write(stage, session, progress)
+
+    first = threading.Thread(target=execute, args=([replace(one, make=slow)], Session()))
+    first.start()
+    assert began.wait(30)
+    said: list[str] = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        if "waiting for process" in line:
+            go.set()
+
+    def work(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        raise AssertionError("ran")
+
+    execute([replace(one, make=work)], Session(), say)
+    first.join()
+    assert said[-1] == "a is there"
+
+
 def test_a_folder_that_cannot_be_written_fails_before_the_work(
     resumable: Callable[[Settings], Stage], tmp_path: Path
 ) -> None:
@@ -305,3 +397,18 @@ def test_a_report_is_drawn_again_when_what_it_shows_has_changed_and_not_before(c
     assert not records.drawn(chain[2])
     (chain[2].folder / "out.txt").unlink()
     assert not records.drawn(report)
+
+
+@pytest.mark.parametrize("way", ["a file for the folder", "a folder for a file", "a folder that cannot be written"])
+def test_what_cannot_be_written_is_known_before_the_first_stage_runs(tmp_path: Path, way: str) -> None:
+    first = stage(tmp_path, "a", Settings())
+    last = stage(tmp_path, "b", Settings(), (first,))
+    if way == "a file for the folder":
+        last.folder.write_text("in the way")
+    elif way == "a folder for a file":
+        (last.folder / "out.txt").mkdir(parents=True)
+    else:
+        last = replace(last, folder=Path("/proc/romnav"), record=Path("/proc/romnav/record.json"))
+    with pytest.raises(RomnavError, match="cannot be written"):
+        prepare([first, last])
+    assert not (first.folder / "out.txt").exists()

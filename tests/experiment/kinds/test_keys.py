@@ -31,6 +31,7 @@ rows = 15
 def workspace(root: Path, scale: str = SCALE) -> Workspace:
     (root / "experiments").mkdir(exist_ok=True, parents=True)
     shutil.copy(ROOT / "experiments" / "spawn-goal.toml", root / "experiments")
+    shutil.copytree(ROOT / "experiments" / "published", root / "experiments" / "published", dirs_exist_ok=True)
     return conftest.workspace(root, scale)
 
 
@@ -126,7 +127,7 @@ def test_the_arms_share_one_encoder(tmp_path: Path) -> None:
 def test_an_arm_that_changes_the_encoder_gets_its_own(tmp_path: Path) -> None:
     here = workspace(tmp_path)
     here.project.file("more").write_text(
-        'kind = "ablation"\ntitle = "t"\ntables = []\n[arms.fine]\nlabel = "Fine"\nlidar.rows = 30\n'
+        'kind = "ablation"\ntitle = "t"\n[arms.fine]\nlabel = "Fine"\nlidar.rows = 30\n'
     )
     own = policy(here, "fine", 0).upstream[0]
     assert own.folder != policy(here, "rom", 0).upstream[0].folder
@@ -135,7 +136,7 @@ def test_an_arm_that_changes_the_encoder_gets_its_own(tmp_path: Path) -> None:
 
 def test_an_arm_without_pretraining_needs_no_encoder(tmp_path: Path) -> None:
     here = workspace(tmp_path)
-    arm = 'kind = "ablation"\ntitle = "t"\ntables = []\n[arms.own]\nlabel = "Own"\n'
+    arm = 'kind = "ablation"\ntitle = "t"\n[arms.own]\nlabel = "Own"\n'
     arm += "navigation.encoder.pretrained = false\n"
     here.project.file("more").write_text(arm)
     own = policy(here, "own", 0)
@@ -180,16 +181,19 @@ def test_unknown_names_are_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(RomnavError, match="unknown arm unifrom; did you mean uniform"):
         episodes(here, "unifrom", 0)
     text = here.project.file("spawn-goal").read_text()
-    here.project.file("spawn-goal").write_text(text.replace("spawngoal-perf-rom", "spawngoal-prf-rom"))
+    here.project.file("spawn-goal").write_text(text.replace('"sr_120"', '"sr_12"'))
     fresh = Workspace(Project(tmp_path, tmp_path / "results"), "tiny")
-    with pytest.raises(RomnavError, match="unknown table spawngoal-prf-rom; did you mean spawngoal-perf-rom"):
+    with pytest.raises(RomnavError, match=r"tables.spawngoal-perf-rom.columns: unknown metric sr_12; did"):
+        report(fresh, "spawn-goal", [0])
+    here.project.file("spawn-goal").write_text(text.replace('"paper"', '"papr"'))
+    fresh = Workspace(Project(tmp_path, tmp_path / "results"), "tiny")
+    with pytest.raises(RomnavError, match=r"spawn-goal.toml: published: no papr.toml; did you mean paper"):
         report(fresh, "spawn-goal", [0])
 
 
 HUMANOID = """
 kind = "ablation"
 title = "t"
-tables = ["spawngoal-perf-rom"]
 [arms.walked]
 label = "RoM policy on the G1"
 policy = "rom"
@@ -242,7 +246,6 @@ def test_another_locomotion_policy_reruns_what_walks_on_it(tmp_path: Path) -> No
 KICKSTART = """
 kind = "ablation"
 title = "taught"
-tables = ["nav-perf"]
 [arms.rom]
 label = "RoM"
 [arms.nav]

@@ -10,7 +10,6 @@ import pytest
 
 from romnav.evaluation.paired import rows
 from romnav.report.page.render import Report, write
-from romnav.report.paired import tables
 from romnav.report.paired.gallery import EpisodeGallery
 
 
@@ -34,11 +33,12 @@ class Page(HTMLParser):
 def text(
     episode_rows: Callable[..., rows.EpisodeRows],
     galleries: dict[str, EpisodeGallery],
+    papers_tables: Callable,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> str:
     made = [episode_rows(arm, skill) for arm, skill in {"rom": 0.8, "uniform": 0.6}.items()]
     path = tmp_path_factory.mktemp("page") / "report.html"
-    write(Report("smoke", tables.build_all(rows.pair(made)), {}, galleries, ("a <b>note</b>",)), path)
+    write(Report("smoke", [*papers_tables(rows.pair(made)).values()], {}, galleries, ("a <b>note</b>",)), path)
     return path.read_text("utf-8")
 
 

@@ -27,7 +27,9 @@ def test_every_run_and_every_ordered_pair(folder: Path) -> None:
     rates = [f"sr_{horizon}{level}" for level in ("", "_same", "_cross") for horizon in (45, 120)]
     keys = {"arm", "seed", "steps", "hours", *rates, "t2g", "spl", "falls", "timeouts"}
     assert all(set(arm) == keys for arm in found["arms"])
-    assert all(set(c) == {"a", "b", "horizon", "level", "diff", "lo", "hi", "n"} for c in found["contrasts"])
+    named, tests = {"a", "b", "horizon", "level", "diff", "lo", "hi", "n"}, {"a_only", "b_only", "mid_p"}
+    assert all(set(c) == named | tests | {"tile_lo", "tile_hi"} for c in found["contrasts"])
+    assert all(c[name] is None for c in found["contrasts"] for name in tests)  # of two runs, not of several seeds
     assert {(c["a"], c["b"]) for c in found["contrasts"]} == {("rom", "uniform"), ("uniform", "rom")}
     assert {(c["horizon"], c["level"]) for c in found["contrasts"]} == {
         (horizon, level) for horizon in (45, 120) for level in ("all", "same", "cross")

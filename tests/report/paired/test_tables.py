@@ -12,8 +12,25 @@ import pytest
 from romnav.errors import RomnavError
 from romnav.evaluation.paired import metrics, rows
 from romnav.evaluation.paired.statistics import Bootstrap
-from romnav.report import formats, paper
+from romnav.experiment.project import Project
+from romnav.report import formats
 from romnav.report.paired import tables
+from romnav.report.spec import PAIRED, Published, TableSpec
+
+ROOT = Path(__file__).parents[3]
+PROJECT = Project(ROOT, ROOT / "results")
+DECLARED = {
+    name: declared
+    for experiment in ("spawn-goal", "kickstart")
+    for name, declared in PROJECT.experiment(experiment).declared(experiment, PAIRED).tables.items()
+}
+
+
+def published() -> Published:
+    found = PROJECT.published("spawn-goal")
+    assert found
+    return found
+
 
 SKILLS = {
     "rom": 0.95,
@@ -45,8 +62,8 @@ def arms(episode_rows) -> list[rows.Arm]:
 
 
 @pytest.fixture(scope="module")
-def built(arms) -> dict[str, formats.Table]:
-    return {table.name: table for table in tables.build_all(arms)}
+def built(arms, papers_tables) -> dict[str, formats.Table]:
+    return papers_tables(arms)
 
 
 def read_latex(text: str) -> list[list[str]]:
@@ -89,9 +106,9 @@ def row(cells: list[list[str]], label: str, nth: int = 0) -> list[str]:
     return [line for line in cells if line[0] == label][nth][1:]
 
 
-def test_every_table_is_built(built) -> None:
-    navigation = ["nav-perf", "nav-levels", "nav-failures", "nav-success"]
-    assert list(built) == ["spawngoal-perf-rom", "spawngoal-levels-rom", *navigation, "spawngoal-success-rom"]
+def test_every_table_of_the_paper_is_declared(built) -> None:
+    spawn_goal = ["spawngoal-perf-rom", "spawngoal-levels-rom", "spawngoal-success-rom"]
+    assert list(built) == [*spawn_goal, "nav-perf", "nav-levels", "nav-failures", "nav-success"]
 
 
 def test_performance_table(built, arms) -> None:
@@ -160,22 +177,27 @@ def test_success_by_level(built, arms) -> None:
 
 
 def test_published_success_by_level_follows_from_what_the_paper_states() -> None:
-    cross = 488 / 1024
+    cross, paper = 488 / 1024, published()
     for arm in ("rom-nav", "rom-hum", "single-stage"):
-        of = paper.PERFORMANCE[arm]
+        of = paper.arms[arm]
         assert cross * of["sr_120_cross"] + (1 - cross) * of["sr_120_same"] == pytest.approx(of["sr_120"], abs=0.2)
         if arm != "single-stage":
             assert of["sr_120_cross"] == pytest.approx(100.0 - of["falls_cross"] - of["timeouts_cross"], abs=0.05)
         if arm != "rom-nav":
-            for level in ("same", "cross"):
-                difference = paper.PERFORMANCE["rom-nav"][f"sr_120_{level}"] - of[f"sr_120_{level}"]
-                assert difference == pytest.approx(paper.CONTRASTS["rom-nav", arm][120, level][0], abs=0.15)
+            for metric in ("sr_120_same", "sr_120_cross"):
+                difference = paper.arms["rom-nav"][metric] - of[metric]
+                assert difference == pytest.approx(paper.contrasts["rom-nav"][arm][metric].diff, abs=0.15)
+
+
+def build_of(name: str, *runs: rows.EpisodeRows, spec: TableSpec | None = None) -> formats.Table:
+    bootstrap = Bootstrap(rows.pair(runs), resamples=50)
+    return tables.build(name, spec or DECLARED[name], "Title", bootstrap, published())
 
 
 def test_ties_share_the_bold(episode_rows) -> None:
     a = episode_rows("rom")
     b = rows.make({**a.columns, "arm": ["uniform"] * len(a)}, a.provenance)
-    table = tables.build_all(rows.pair([a, b]))[0]
+    table = build_of("spawngoal-perf-rom", a, b)
     assert [r.cells[0].bold for r in table.blocks[0].rows] == [True, True, False, False]
     assert [r.cells[0].text for r in table.blocks[0].rows][2:] == ["–", "–"]
 
@@ -189,7 +211,7 @@ def test_levels_table(built, arms) -> None:
     expected = []
     for horizon in (45, 120):
         for level in ("same", "cross"):
-            c = bootstrap.contrast("rom", "uniform", horizon, level)
+            c = bootstrap.contrast("rom", "uniform", f"sr_{horizon}", level)
             expected.append(f"${c.diff:+.1f}${dagger if c.significant else ''}")
     assert row(cells, "RoM $-$ Uniform") == expected
     assert [line[0] for line in cells].count("RoM $-$ Oracle") == 1
@@ -219,7 +241,7 @@ def test_csv_holds_unrounded_numbers_with_intervals(built, arms) -> None:
     lines = list(csv.DictReader(io.StringIO(text)))
     wanted = {"source": "ours", "row": "RoM − Uniform", "column": "sr_120_cross"}
     (line,) = [x for x in lines if wanted.items() <= x.items()]
-    c = Bootstrap(arms).contrast("rom", "uniform", 120, "cross")
+    c = Bootstrap(arms).contrast("rom", "uniform", "sr_120", "cross")
     assert (float(line["value"]), float(line["lo"]), float(line["hi"])) == (c.diff, c.lo, c.hi)
     assert (int(line["n"]), bool(int(line["dagger"]))) == (c.n, c.significant)
     assert (int(line["a_only"]), int(line["b_only"]), float(line["mid_p"])) == (c.a_only, c.b_only, c.mid_p)
@@ -233,49 +255,99 @@ def test_negative_zero_is_zero() -> None:
     assert formats.number(-0.04, 1, sign=True).text == "+0.0"
 
 
-def test_no_table_without_its_reference_arm(episode_rows) -> None:
-    with pytest.raises(RomnavError, match="evaluate rom or rom-nav and another arm"):
-        tables.build_all(rows.pair([episode_rows("uniform"), episode_rows("nocap")]))
-    with pytest.raises(RomnavError, match="another arm"):
-        tables.build_all(rows.pair([episode_rows("rom")]))
-
-
 def test_a_table_needs_one_of_its_arms(episode_rows) -> None:
-    bootstrap = Bootstrap(rows.pair([episode_rows("uniform")]))
+    uniform = episode_rows("uniform")
     with pytest.raises(RomnavError, match=r"table nav-levels: no arm .* evaluate rom-nav first"):
-        tables.build(tables.SPECS[3], bootstrap)
-    lone = tables.build(tables.SPECS[1], bootstrap)  # the reference is missing: nothing to subtract from
+        build_of("nav-levels", uniform)
+    with pytest.raises(RomnavError, match=r"table nav-perf: no arm .* evaluate rom first"):
+        build_of("nav-perf", episode_rows("oracle-hum"))  # a bound alone
+    lone = build_of("spawngoal-levels-rom", uniform)  # the reference is missing: nothing to subtract from
     assert {cell.text for r in lone.blocks[0].rows for cell in r.cells} == {"–"}
     assert row(read_latex(formats.latex(lone)), "RoM $-$ Uniform") == ["--"] * 4
 
 
-def test_arms_that_the_paper_has_no_numbers_of_are_dashes_there(episode_rows) -> None:
-    mine = tables.Entry("mine", "Mine")
-    rom = tables.Entry("rom", "RoM")
-    columns = (tables.Column("sr_45", "SR@45", 1, max),)
-    bootstrap = Bootstrap(rows.pair([episode_rows("rom"), episode_rows("mine", 0.2)]), resamples=50)
-    performance = tables.build(tables.PerformanceSpec("own", "Own.", rom, ((rom, mine),), columns), bootstrap)
-    levels = tables.build(tables.LevelsSpec("own-levels", "Own.", rom, (mine,)), bootstrap)
-    for table in (performance, levels):
-        ours, paper_ = ([row.cells[0].text for row in b.rows] for b in table.blocks)
-        assert paper_[-1] == "–" != ours[-1]
+def test_the_caption_of_untrained_arms_says_nothing_of_training(episode_rows) -> None:
+    spec = DECLARED["spawngoal-perf-rom"].model_copy(update={"rows": (DECLARED["spawngoal-perf-rom"].bounds,)})
+    caption = build_of("bounds", episode_rows("oracle", steps=0), spec=spec).caption
+    assert "This work: smoke scale, 64 paired episodes of set" in caption
+    assert "training" not in caption[caption.index("This work") :]
+
+
+OWN = """
+kind = "ablation"
+title = "Mine"
+reference = "b"
+[arms.a]
+label = "A"
+[arms.b]
+label = "B"
+"""
+
+
+def own(tmp_path: Path, more: str = "") -> dict[str, TableSpec]:
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments" / "own.toml").write_text(OWN + more)
+    return Project(tmp_path, tmp_path).experiment("own").declared("own", PAIRED).tables
+
+
+def test_labels_alone_give_tables(tmp_path: Path, episode_rows) -> None:
+    specs = own(tmp_path)
+    assert list(specs) == ["own", "own-contrasts"]
+    runs = [episode_rows("a"), episode_rows("b", 0.2), episode_rows("oracle", 1.0, steps=0)]
+    bootstrap = Bootstrap(rows.pair(runs), resamples=50)
+    arms, contrasts = (tables.build(name, spec, "Mine", bootstrap) for name, spec in specs.items())
+    assert [r.label for block in arms.blocks for r in block.rows] == ["A", "B", "Oracle"]
+    assert arms.header == ("Arm", "SR@45 (%)", "SR@120 (%)", "T2G (s)", "SPL")
+    assert arms.caption.startswith("Mine. SR@45: success within 45 s; SR@120:")
+    assert [r.label for block in contrasts.blocks for r in block.rows] == ["B − A", "B − Oracle"]
+    assert contrasts.caption.startswith("Mine: paired differences of B to each other arm.")
+    assert "Paper" not in arms.caption + contrasts.caption
+    assert {block.source for block in (*arms.blocks, *contrasts.blocks)} == {"ours"}
+
+
+def test_any_metric_is_a_column_and_can_be_contrasted(tmp_path: Path, episode_rows) -> None:
+    columns = 'columns = ["collisions", "falls_cross", { metric = "spl", header = "Way" }]\n'
+    declared = f'[tables.mine]\nrows = ["b"]\n{columns}[tables.less]\nkind = "contrasts"\n{columns}'
+    specs = own(tmp_path, declared)
+    a, b = episode_rows("a"), episode_rows("b", 0.2)
+    bootstrap = Bootstrap(rows.pair([a, b]), resamples=50)
+    mine, less = (tables.build(name, spec, "Mine", bootstrap) for name, spec in specs.items())
+    headers = ("Contact (per 100 m)", "Falls, cross (%)", "Way")
+    assert (mine.header, less.header) == (("Arm", *headers), ("Contrast", *headers))
+    assert less.spans == ()
+    of_a, of_b = (metrics.evaluate(run.columns) for run in (a, b))
+    assert mine.blocks[0].rows[0].cells[2].text == f"{of_b['spl']:.3f}"
+    assert less.blocks[0].rows[0].cells[2].value == pytest.approx(of_b["spl"] - of_a["spl"])
+    falls = less.blocks[0].rows[0].cells[1].facts
+    fell = [(run.columns["outcome"] == "fall") & (run.columns["level"] == "cross") for run in (b, a)]
+    assert (falls["a_only"], falls["b_only"]) == ((fell[0] & ~fell[1]).sum(), (fell[1] & ~fell[0]).sum())
+
+
+def test_every_metric_has_a_name_and_a_meaning() -> None:
+    for name in tables.known_metrics("performance"):
+        assert tables.meaning(name).definition
+    assert tables.known_metrics("performance")[-2:] == ["steps", "hours"]
+    assert "steps" not in tables.known_metrics("contrasts")
 
 
 def test_every_arm_that_competes_has_published_numbers() -> None:
-    for spec in tables.SPECS:
-        arms = [entry.arm for entry in spec.entries if entry not in spec.bounds]
-        assert set(arms) <= set(paper.PERFORMANCE)
-        if isinstance(spec, tables.LevelsSpec):
-            assert {(spec.reference.arm, other.arm) for other in spec.others} <= set(paper.CONTRASTS)
+    paper = published()
+    for spec in DECLARED.values():
+        arms = {entry.arm for block in spec.rows for entry in block}
+        assert arms <= paper.arms.keys()
+        if spec.kind == "contrasts":
+            assert arms <= paper.contrasts[spec.reference.arm].keys()
 
 
 def test_published_contrasts_lie_between_their_levels() -> None:
     """The published overall difference is a mean of the published differences of both levels."""
-    for (a, b), by in paper.CONTRASTS.items():
-        for horizon in (45, 120):
-            difference = paper.PERFORMANCE[a][f"sr_{horizon}"] - paper.PERFORMANCE[b][f"sr_{horizon}"]
-            low, high = sorted(by[horizon, level][0] for level in ("same", "cross"))
-            assert low <= difference <= high
+    paper = published()
+    for a, others in paper.contrasts.items():
+        for b, by in others.items():
+            for metric in ("sr_45", "sr_120"):
+                difference = paper.arms[a][metric] - paper.arms[b][metric]
+                low, high = sorted(by[f"{metric}_{level}"].diff for level in ("same", "cross"))
+                assert low <= difference <= high
 
 
 @pytest.mark.skipif(not shutil.which("pdflatex"), reason="no LaTeX on this machine; read_latex checks the structure")

@@ -3,16 +3,27 @@ from __future__ import annotations
 import csv
 import io
 import re
+from pathlib import Path
 
 import pytest
 
 from romnav.evaluation.trials.statistics import closed_routes, summarise
+from romnav.experiment.project import Project
 from romnav.report import formats
+from romnav.report.spec import Published
 from romnav.report.trials import tables as trial_tables
 from romnav.world.scenes.deployments import deployment_scenes
 from romnav.world.scenes.obstacles import obstacle_scenes
 
 LABELS = {"rom": "RoM"}
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def paper() -> Published:
+    found = Project(ROOT, ROOT / "results").published("safety")
+    assert found
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -20,9 +31,9 @@ def scenes():
     return obstacle_scenes()
 
 
-def test_safety_shows_ten_trials_as_the_paper_and_all_with_intervals(trial_run, scenes) -> None:
+def test_safety_shows_ten_trials_as_the_paper_and_all_with_intervals(trial_run, scenes, paper) -> None:
     runs = [trial_run("rom", n=64), trial_run("oracle", n=64, skill=1.0)]
-    table = trial_tables.safety(runs, scenes, LABELS)
+    table = trial_tables.safety(runs, scenes, LABELS, paper)
     rom, oracle, published = table.blocks
     assert [len(block.rows) for block in table.blocks] == [9, 9, 6]
     row = rom.rows[1]
@@ -41,10 +52,10 @@ def test_safety_shows_ten_trials_as_the_paper_and_all_with_intervals(trial_run, 
     assert f"RoM {held} and {closed};" in table.caption
 
 
-def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run) -> None:
+def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run, paper) -> None:
     scenes = deployment_scenes()
     run = trial_run("rom", n=16, scenes=[scene.name for scene in scenes])
-    table = trial_tables.deploy([run], scenes, LABELS)
+    table = trial_tables.deploy([run], scenes, LABELS, paper)
     ours, published = table.blocks
     assert [row.label for row in ours.rows[:2]] == ["Cluttered lab, no CBF", "Cluttered lab, CBF"]
     assert [row.cells[3].text for row in published.rows] == ["38", "51", "51", "100"]
@@ -55,6 +66,7 @@ def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run
 
 def test_all_formats_hold_the_numbers(trial_run, scenes) -> None:
     table = trial_tables.safety([trial_run("rom", n=64)], scenes, LABELS)
+    assert {block.source for block in table.blocks} == {"ours"}
     text = formats.latex(table)
     assert r"$\pm$" in text
     assert "±" not in text

@@ -8,9 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from romnav.robot.g1 import Boxes, Humanoids
+from romnav.robot.g1 import Humanoids
 from romnav.robot.locomotion.legs import Legs, rotation
 from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import NOTHING
 
 REST = torch.tensor([-0.3, 0.0, 0.0, 0.6, -0.3, 0.0])
 BENT = torch.tensor([-0.45, 0.0, 0.0, 0.9, -0.45, 0.0])
@@ -18,7 +19,7 @@ BENT = torch.tensor([-0.45, 0.0, 0.0, 0.9, -0.45, 0.0])
 
 @pytest.fixture(scope="module")
 def robots() -> Humanoids:
-    return Humanoids(RobotSpec(), Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4))), 4, threads=1)
+    return Humanoids(RobotSpec(), [NOTHING], 4, threads=1)
 
 
 @pytest.fixture(scope="module")

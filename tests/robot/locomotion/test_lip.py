@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from romnav.robot.g1 import FOOT_LENGTH, Boxes, build_spec
+from romnav.robot.g1 import FOOT_LENGTH, build_spec
 from romnav.robot.locomotion.legs import Legs
 from romnav.robot.locomotion.lip import (
     Walker,
@@ -26,6 +26,7 @@ from romnav.robot.locomotion.lip import (
     wrap,
 )
 from romnav.robot.spec import GaitSpec, RobotSpec
+from romnav.robot.statics import NOTHING
 
 W, T, WIDTH = frequency(0.66), 0.4, 0.2
 velocities = st.tuples(st.floats(-0.5, 1.0), st.floats(-0.25, 0.25))
@@ -125,7 +126,7 @@ def test_stairs_are_walked_a_little_faster_than_told_but_only_forwards() -> None
 
 @pytest.fixture(scope="module")
 def walker() -> Walker:
-    model = build_spec(RobotSpec(), Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))).compile()
+    model = build_spec(RobotSpec(), NOTHING).compile()
     return Walker(GaitSpec(), Legs(model), 0.02, 1)
 
 

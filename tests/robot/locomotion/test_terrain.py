@@ -21,7 +21,7 @@ def ground() -> Ground:
 
 
 def test_height_map_is_what_rays_hit(ground: Ground) -> None:
-    model = build_spec(RobotSpec(), ground.boxes).compile()
+    model = build_spec(RobotSpec(), ground.geoms).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     rng = np.random.default_rng(1)

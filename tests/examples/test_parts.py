@@ -1,0 +1,141 @@
+"""The examples of parts from outside do what they say."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse.csgraph import connected_components
+
+from romnav.errors import RomnavError
+from romnav.evaluation import episodes
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Oracle, Straight
+from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
+from romnav.experiment.kinds import episodes as kinds
+from romnav.experiment.kinds.locomotion import body
+from romnav.experiment.kinds.policy import policy
+from romnav.experiment.project import Project
+from romnav.experiment.spec import DRIVERS
+from romnav.experiment.workspace import Workspace
+from romnav.navigation import checkpoint
+from romnav.navigation.env import NavigationEnv
+from romnav.navigation.train import train
+from romnav.world.build import build
+from romnav.world.spec import SamplerSpec, WorldSpec
+from romnav.world.tiles.generate import generate
+from tests.navigation.conftest import FakePerception
+
+MAZE = "examples.maze:Maze"
+
+
+def test_every_arm_says_in_its_key_what_code_it_runs(work: Workspace) -> None:
+    named = {
+        "maze": "world",
+        "no-progress": "navigation",
+        "without-attention": "navigation",
+        "unicycle": "navigation",
+    }
+    for arm, section in named.items():
+        stage = policy(work, arm, 0)
+        assert "@" in str(stage.spec[section])
+        assert "examples." in str(stage.spec[section])
+    driven = kinds.episodes(work, "wall-follower", 0)
+    assert driven.upstream == ()
+    assert driven.spec["code"][0].startswith("examples.wall_follower:WallFollower@")
+    assert "@" in kinds.episodes(work, "unicycle", 0).upstream[-1].spec["navigation"]["dynamics"]
+
+
+def test_a_maze_is_perfect(work: Workspace) -> None:
+    """All of its cells are connected; and by one way only, so that a wall more would cut it."""
+    spec = WorldSpec(classes=(MAZE,), tiles=1, side=20.0)
+    tile, grids = generate(spec, 0)
+    assert tile.kind == MAZE
+    assert tile.draws == 1
+    cells = 8
+    middles = (np.arange(cells) + 0.5) * 2.5
+    at = (middles / grids.cell).astype(int)
+    free = grids.node[0] >= 0
+    assert free[np.ix_(at, at)].all()
+    across = [(i, j, i + 1, j) for i in range(cells - 1) for j in range(cells)]
+    across += [(i, j, i, j + 1) for i in range(cells) for j in range(cells - 1)]
+    links = np.zeros((cells**2, cells**2))
+    for i, j, k, m in across:
+        between = (at[i] + at[k]) // 2, (at[j] + at[m]) // 2
+        links[i * cells + j, k * cells + m] = free[between]
+    assert links.sum() == cells**2 - 1
+    assert connected_components(links, directed=False)[0] == 1
+
+
+def test_steps_without_progress_cost_their_weight(work: Workspace) -> None:
+    plain, settings = work.settings.navigation.env, work.arm_settings("no-progress").navigation.env
+    world = build(work.settings.world)
+    total = []
+    for spec in (plain, settings):
+        env = NavigationEnv(
+            world, body(work, work.settings, 0, "cpu", 1)(world, 8, 0.2), FakePerception(), spec, 0, "cpu"
+        )
+        action = torch.zeros(8, 3) + torch.tensor([-1 / 3, 0.0, 1.0])  # turns on the spot
+        total.append(sum(env.step(action)[1] for _ in range(3)))
+        reward = env.statistics().reward
+    torch.testing.assert_close(total[1] - total[0], torch.full((8,), -0.05 * 0.2 * 3))
+    assert reward["examples.no_progress:no_progress"] == pytest.approx(-0.01)
+
+
+def test_a_policy_without_attention_is_trained_and_loaded(work: Workspace, tmp_path: Path) -> None:
+    spec = work.arm_settings("without-attention").navigation
+    perception = FakePerception()
+    path = train(spec, build(work.settings.world), perception, tmp_path, 0)
+    actor = checkpoint.load_actor(path, perception.encoder)
+    assert type(actor).__name__ == "WithoutAttention"
+    assert not any("qkv" in name for name in actor.state_dict())
+
+
+def test_a_unicycle_takes_no_sidesteps(work: Workspace) -> None:
+    settings, world = work.arm_settings("unicycle"), build(work.settings.world)
+    robots = body(work, settings, 0, "cpu", 1)(world, 4, 0.2)
+    free = torch.from_numpy(np.flatnonzero(world.layer[: world.node_start[1]] == 0))[:4]
+    robots.position[:, :2] = world.position[free, :2]
+    before = robots.position.clone()
+    robots.step(torch.tensor([[0.0, 0.25, 0.0]]).repeat(4, 1))
+    assert torch.equal(robots.position[:, :2], before[:, :2])
+    robots.step(torch.tensor([[0.0, 0.0, 1.0]]).repeat(4, 1))
+    assert robots.yaw[0].item() == pytest.approx(0.2)
+
+
+def test_following_walls_lies_between_the_other_bounds(work: Workspace) -> None:
+    """In rooms: better than straight ahead, worse than one who knows the map."""
+    spec = EpisodeSetSpec(
+        world=WorldSpec(classes=("room",), tiles=4, seed=9, goals_per_tile=16, side=20.0),
+        episodes=96,
+        cross=0,
+        sampler=SamplerSpec(stair_probability=0.0, min_distance=6.0),
+    )
+    world = build(spec.world)
+    paired = episodes.draw("rooms", spec, world)
+    env, evaluation = work.settings.navigation.env, EvaluationSpec(duration=60.0)
+    drivers = [Straight(), DRIVERS.load("examples.wall_follower:WallFollower"), Oracle()]
+    reached = [(run(d, world, paired, env, evaluation)["outcome"] == "success").mean() for d in drivers]
+    assert reached[0] + 0.05 < reached[1] < reached[2]
+
+
+@pytest.mark.parametrize(
+    ("arm", "key", "message"),
+    [
+        ("without-attention", "navigation.policy.network", "policy network examples.maze:Maze: lacks the base class"),
+        ("unicycle", "navigation.dynamics", "body examples.maze:Maze: lacks proprioception, see"),
+    ],
+)
+def test_a_part_of_another_kind_is_one_clear_line(
+    work: Workspace, tmp_path: Path, arm: str, key: str, message: str
+) -> None:
+    shutil.copytree(work.project.root, tmp_path, dirs_exist_ok=True)
+    file = tmp_path / "experiments" / "parts.toml"
+    name = {"without-attention": "without_attention:WithoutAttention", "unicycle": "unicycle:Unicycle"}[arm]
+    file.write_text(file.read_text().replace(f"examples.{name}", MAZE))
+    broken = Workspace(Project(tmp_path, tmp_path / "results"), "smoke")
+    with pytest.raises(RomnavError, match=f"parts.toml: arms.{arm}.{key}: {message}"):
+        broken.arm_settings(arm)
