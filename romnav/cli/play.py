@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -76,11 +77,14 @@ def episode(
     out: Annotated[
         Path | None, typer.Option(help="MP4 or GIF to write; default: results/<scale>/figures/<arm>-<episode>.mp4.")
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.1, help="Times as fast as it was.")] = 2.0,
-    size: Annotated[int, typer.Option(min=64, help="Height of the picture, pixels; it is twice as wide.")] = 480,
-    seed: Annotated[int, typer.Option("--seed", help="Training seed.")] = 0,
+    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Times as fast as it was.")] = 2.0,
+    size: Annotated[int, typer.Option(min=64, max=2048, help="Height, pixels; the width is twice that.")] = 480,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Training seed.")] = 0,
 ) -> None:
     """Film an episode of an arm, from behind and from above; the humanoid with its meshes."""
+    from romnav.report.replay import opengl
+
+    opengl.choose()
     from romnav.experiment.kinds.replays import Again
     from romnav.progress import bar
 

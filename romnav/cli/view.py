@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from romnav.cli.app import app
-from romnav.cli.options import AtScale, arms, command
+from romnav.cli.options import LARGEST_SEED, AtScale, arms, command
 from romnav.errors import RomnavError
 
 
@@ -25,7 +25,7 @@ def view(
     guarded: Annotated[
         bool, typer.Option("--filter", help="Let the safety filter look on, and show its h and command.")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Training seed.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Training seed.")] = 0,
     host: Annotated[
         str, typer.Option(help="Address to listen on; the default is for this machine only.")
     ] = "127.0.0.1",

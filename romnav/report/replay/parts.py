@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from romnav.robot.g1 import NOTHING, build_spec
+from romnav.robot.g1 import build_spec
 from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import NOTHING
 from romnav.world.mesh import triangulate
 from romnav.world.solids import Label
 from romnav.world.tile import Tile

@@ -14,11 +14,13 @@ from PIL import Image
 from romnav import files
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.replay import Replay
+from romnav.report.replay.opengl import FIX
 from romnav.report.replay.parts import ARMS, COLOURS, storeys
-from romnav.robot.g1 import OBSTACLES, build_spec
+from romnav.robot.g1 import build_spec
 from romnav.robot.spec import RobotSpec
-from romnav.robot.tiles import add_solid
-from romnav.world.solids import Label
+from romnav.robot.statics import OBSTACLES
+from romnav.robot.tiles import geoms
+from romnav.world.solids import Label, Solids
 from romnav.world.tile import Tile
 
 RATE = 15
@@ -38,19 +40,22 @@ COLOURS_OF_A_GIF = 96
 
 
 class _Scenery:
-    """A tile to look at: nothing collides, walls are translucent."""
+    """Solids to look at: nothing collides, and what would hide the robot is translucent."""
 
-    def __init__(self, tile: Tile) -> None:
-        self._tile = tile
+    def __init__(self, solids: Solids) -> None:
+        self._solids, self._geoms = solids, geoms(solids)
 
     def add_to(self, model: mujoco.MjSpec) -> None:
-        solids = self._tile.solids
-        for k in range(len(solids)):
-            geom = add_solid(model, solids[k : k + 1])
-            tall = solids.label[k] == Label.OBSTACLE and solids.top[k] - solids.bottom[k] > HEIGHT / 2
-            geom.rgba = [*np.array(COLOURS[Label(solids.label[k])]) / 255.0, GLASS if tall else 1.0]
-            geom.contype = geom.conaffinity = 0
-            geom.name = f"solid {k}"
+        """Add them all, named by their number."""
+        before = len(model.worldbody.geoms)
+        self._geoms.add_to(model)
+        obstacle = self._geoms.obstacle
+        for body, first, chosen in ((model.worldbody, before, ~obstacle), (model.body(OBSTACLES), 0, obstacle)):
+            for geom, k in zip(body.geoms[first:], np.flatnonzero(chosen), strict=True):
+                label = Label(self._solids.label[k])
+                tall = label == Label.OBSTACLE and self._solids.top[k] - self._solids.bottom[k] > HEIGHT / 2
+                geom.name, geom.rgba = f"solid {k}", [*np.array(COLOURS[label]) / 255.0, GLASS if tall else 1.0]
+                geom.contype = geom.conaffinity = 0
 
 
 class Film:
@@ -72,11 +77,14 @@ class Film:
         self, tile: Tile, replay: Replay, goal: NDArray, route: NDArray, robot: RobotSpec, size: int = 480
     ) -> None:
         self._replay, self._goal, self._route, self._size = replay, goal, route, size
-        scenery = _Scenery(tile)
+        standing = tile.solids.top + np.abs(tile.solids.slope_top) * tile.solids.half[:, 0] > 1e-6
+        solids = tile.solids[standing]
+        scenery = _Scenery(solids)
         if replay.joints is not None:
             spec = build_spec(robot, scenery, visual=True)
         else:
             spec = mujoco.MjSpec()
+            spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
             spec.worldbody.add_body(name=OBSTACLES)
             scenery.add_to(spec)
             body = spec.worldbody.add_body(name="robot", mocap=True)
@@ -87,6 +95,7 @@ class Film:
             )
             nose = [0.2, 0.05, 0.05]
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=[RADIUS, 0, HEIGHT - 0.2], size=nose, rgba=[1, 1, 1, 1])
+        spec.geom("floor").rgba = [*np.array(COLOURS[Label.GROUND]) / 255.0, 1.0]
         # without shadows, which take software most of its time
         sun = spec.worldbody.add_light(dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         sun.castshadow, sun.diffuse = False, [0.35] * 3
@@ -97,17 +106,14 @@ class Film:
         spec.visual.global_.offwidth = spec.visual.global_.offheight = size
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._solids = np.array([self._model.geom(f"solid {k}").id for k in range(len(tile.solids))])
-        self._bottom = np.where(tile.solids.walkable, tile.solids.top, tile.solids.bottom)
+        self._solids = np.array([self._model.geom(f"solid {k}").id for k in range(len(solids))])
+        self._bottom = np.where(solids.walkable, solids.top, solids.bottom)
         self._alpha = self._model.geom_rgba[self._solids, 3].copy()
-        self._ground = storeys(tile) == 0
+        self._ground = storeys(tile)[standing] == 0
         try:
             self._renderer = mujoco.Renderer(self._model, size, size)
         except Exception as error:  # of OpenGL, of any kind
-            raise RomnavError(
-                f"no OpenGL to draw with ({str(error).splitlines()[0]}); install Mesa (Debian: libegl1 or libosmesa6) "
-                "and set MUJOCO_GL to egl or osmesa"
-            ) from error
+            raise RomnavError(f"no OpenGL to draw with ({str(error).splitlines()[0]}); {FIX}") from error
 
     def frames(self, speed: float, period: float) -> Iterator[NDArray[np.uint8]]:
         """(size, 2 size, 3) pictures, `RATE` a second, of the replay run ``speed`` times as fast.

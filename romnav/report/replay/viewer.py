@@ -34,6 +34,7 @@ FRAME = 1 / 30
 """Time between two pictures of a playing replay, s."""
 UP, BACK = np.array([0.0, 0.0, 1.0]), np.array([-12.0, -12.0, 16.0])
 """The vertical, and where an episode is looked at from, m."""
+NO_TIME = {"x": viser.uplot.Scale(time=False)}
 SPEEDS = ("1", "2", "4", "8", "16")
 
 
@@ -132,7 +133,9 @@ class Viewer:
                 viser.uplot.Series(label=name, stroke=stroke, width=2)
                 for name, stroke in (("vx", "#1f6fb4"), ("vy", "#d55e00"), ("wz", "#009e73"))
             ]
-            self._betas = gui.add_uplot((grid, *(np.zeros_like(grid),) * 3), tuple(series), aspect=1.6, visible=False)
+            self._betas = gui.add_uplot(
+                (grid, *(np.zeros_like(grid),) * 3), tuple(series), aspect=1.6, visible=False, scales=NO_TIME
+            )
         self._choice.on_update(lambda _: self._open(int(self._choice.value)))
         self._time.on_update(lambda _: self._show(int(self._time.value)))
         for control in (self._storeys, self._follow):
