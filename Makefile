@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup lock demo test check tables bench nightly
+.PHONY: setup lock demo test check tables numbers bench docs nightly
 
 setup: $(VENV)/stamp
 
@@ -36,6 +36,13 @@ bench: setup
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/romnav bench
 
+docs: setup
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 nightly: setup
 	$(BIN)/romnav --results .cache/nightly run ablation spawn-goal --scale $(SCALE) --no-resume
 	$(BIN)/romnav --results .cache/nightly check --scale $(SCALE)
+
+numbers: setup
+	$(BIN)/python tools/numbers_in_pages.py

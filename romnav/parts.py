@@ -66,10 +66,17 @@ class Kind:
         name = name.partition("@")[0]
         return f"{name}@{digest(self._target(name))}"
 
+    def outside(self, name: str) -> bool:
+        """Whether a name is that of a part from outside, be it there or not."""
+        return ":" in name or name in self._points()
+
+    def _points(self) -> dict[str, str]:
+        return {point.name: point.value for point in metadata.entry_points(group=self.group)}
+
     def _target(self, name: str) -> str:
         if ":" in name:
             return name
-        points = {point.name: point.value for point in metadata.entry_points(group=self.group)}
+        points = self._points()
         if name not in points:
             known = ", ".join([*self.builtin, *sorted(points)])
             there = f"there are {known}; " if known else ""

@@ -22,6 +22,10 @@ def bench(
     from romnav.experiment.spec import suggest
 
     files = {file.stem: file for file in sorted((here.project.root / "benchmarks").glob("[!_]*.py"))}
+    if not files:
+        raise RomnavError(
+            f"{here.project.root / 'benchmarks'}: no benchmarks; change to a copy of the romnav repository"
+        )
     if name and name not in files:
         raise RomnavError(f"unknown benchmark {name}{suggest(name, files)}")
     for benchmark in [name] if name else files:

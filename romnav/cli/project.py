@@ -1,7 +1,8 @@
-"""``romnav list`` and ``episodes``: what the project holds, and one thing to add to it."""
+"""``romnav init``, ``list`` and ``episodes``: a new project, what it holds, and one thing to add to it."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,6 +10,17 @@ import typer
 from romnav.cli.app import app
 from romnav.cli.options import LARGEST_SEED, InProject, command
 from romnav.errors import RomnavError
+
+
+@app.command("init")
+def init(
+    folder: Annotated[Path, typer.Argument(help="Folder to make, or one without experiments/.")] = Path(),
+) -> None:
+    """Make a project folder: the experiments, scales and episode sets to begin with, and the small policies."""
+    from romnav.experiment import template
+
+    template.init(folder)
+    typer.echo(f"{folder}: a project; there, run `romnav list`, or copy experiments/spawn-goal.toml and change a line")
 
 
 @command(app, "list")
@@ -53,6 +65,8 @@ def episodes(
     here: InProject,
     name: Annotated[str, typer.Argument(help="Name of the new set, a file under experiments/episodes/.")],
     seed: Annotated[int, typer.Option(help="Seed of terrain and draw.", min=0, max=LARGEST_SEED)] = 3000,
+    tiles: Annotated[int, typer.Option(help="Tiles of the terrain.", min=1)] = 64,
+    count: Annotated[int, typer.Option(help="Episodes.", min=1)] = 1024,
 ) -> None:
     """Draw a new set of paired episodes; existing ones are never replaced."""
     from romnav import config
@@ -66,8 +80,9 @@ def episodes(
         raise RomnavError(f"episode set {error}") from error
     if path.exists():
         raise RomnavError(f"{path}: exists, and results refer to it; choose another name")
-    spec = EpisodeSetSpec(seed=seed)
-    spec = spec.model_copy(update={"world": spec.world.model_copy(update={"seed": seed})})
+    paper = EpisodeSetSpec()
+    world = paper.world.model_copy(update={"seed": seed, "tiles": tiles})
+    spec = EpisodeSetSpec(world=world, episodes=count, cross=count * paper.cross // paper.episodes, seed=seed)
     drawn = episodes.draw(name, spec, build(spec.world))
     episodes.save(path, drawn)
     typer.echo(f"{path}: {len(drawn)} episodes, {drawn.cross.mean():.0%} across levels, hash {drawn.digest}")

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from romnav.threads import cores
 
+FEWEST = 6
+"""Units of which an interval can be told: of fewer, a sign test at 5 % proves nothing even if all of them agree."""
 _BLOCK = 128  # resamples at a time: their counts stay in the cache
 
 
@@ -38,6 +40,18 @@ def resampled_sums(values: NDArray, resamples: int, seed: int = 0) -> NDArray:
     with ThreadPoolExecutor(cores()) as pool:
         sums = np.concatenate(list(pool.map(block, range(-(-resamples // _BLOCK)))), axis=1)
     return sums[:, :resamples].reshape(*values.shape[:-1], resamples).astype(float)
+
+
+def percentile_interval(draws: NDArray, units: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Interval of a statistic from its values in resamples of ``units``, those in which it exists.
+
+    NaN where there are fewer than `FEWEST` units: of a few that agree every resample agrees, which proves nothing.
+    """
+    draws = draws[np.isfinite(draws)]
+    if units < FEWEST or not len(draws):
+        return math.nan, math.nan
+    lo, hi = np.percentile(draws, (50 * (1 - confidence), 50 * (1 + confidence)))
+    return float(lo), float(hi)
 
 
 def mcnemar_mid_p(a_only: int, b_only: int) -> float:

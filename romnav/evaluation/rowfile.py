@@ -5,6 +5,7 @@ Rows are all that evaluation hands on: metrics, tables and figures are pure func
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,10 @@ class Provenance(Config):
     """Wall-clock time of training, h."""
     machine: str
     """Processor or GPU, and the operating system."""
+    duration: float | None = None
+    """Longest episode, s; files from before it was written down do not tell."""
+    reach: float | None = None
+    """Distance to the goal that is success, m; likewise."""
 
 
 @dataclass(frozen=True)
@@ -73,21 +78,23 @@ class RowFile:
         arrays = {field.name: pa.array(columns[field.name], type=field.type) for field in self.schema}
         with files.atomic(path) as file:
             table = pa.table(arrays, schema=self.schema.with_metadata(metadata))
-            pq.write_table(table, file, compression=self.compression)
+            pq.write_table(table, file, compression=self.compression, write_page_checksum=True)
 
     def read(self, path: Path, *facts: str) -> tuple[pa.Table, Provenance, dict[str, str]]:
         """Reads rows, where they come from, and the ``facts`` that hold for all of them.
 
         Raises:
-            RomnavError: The file is missing, truncated or of another schema.
+            RomnavError: The file is missing, damaged, of another schema, or not what the record beside it tells of.
         """
+        self._check_record(path)
         try:
-            table = pq.ParquetFile(path).read()
+            table = pq.ParquetFile(path, page_checksum_verification=True).read()
         except FileNotFoundError as error:
             raise RomnavError(
                 f"{path}: no such file of {self.key}; {self.again.removesuffix(' again')} first"
             ) from error
-        except (OSError, pa.ArrowException) as error:
+        except Exception as error:
+            # a damaged file can make the reader fail in any way
             raise RomnavError(f"{path}: not a readable parquet file (truncated?); {self.again}") from error
         stored = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
         about = {key.removeprefix("romnav."): value for key, value in stored.items() if key.startswith("romnav.")}
@@ -101,6 +108,21 @@ class RowFile:
             key = ".".join(str(part) for part in error.errors()[0]["loc"])
             raise RomnavError(f"{path}: provenance key {key}: {error.errors()[0]['msg']}; {self.again}") from error
         return table, provenance, {fact: about[fact] for fact in facts}
+
+    def _check_record(self, path: Path) -> None:
+        """Compares a file with the digest in the record beside it; without a record, rows stand for themselves."""
+        record = path.with_suffix(".json")
+        try:
+            recorded = json.loads(record.read_text("utf-8"))["outputs"].get(path.name)
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RomnavError(f"{record}: damaged record; restore it, or delete it and {self.again}") from error
+        if recorded and path.exists() and files.digest(path) != recorded:
+            raise RomnavError(
+                f"{path}: not the file that {record.name} recorded (truncated, edited); restore it, or delete it and "
+                f"{self.again}"
+            )
 
     def require(self, columns: Mapping[str, NDArray], holds: Mapping[str, NDArray], source: str, row: str) -> None:
         """Checks that what must hold of a column does, row by row; of the outcomes it always is the same.

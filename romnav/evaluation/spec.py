@@ -8,10 +8,13 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from romnav.config import Config, Count, Name, Positive, Seed, Threads
+from romnav.parts import Kind
 from romnav.robot.spec import BodySpec
 from romnav.safety.spec import SafetySpec
 from romnav.sensing.spec import CorruptionSpec, LidarSpec
 from romnav.world.spec import SamplerSpec, WorldSpec
+
+METRICS = Kind("metric", "romnav.metrics", "romnav.evaluation.paired.metrics:Measure")
 
 
 class EpisodeSetSpec(Config):

@@ -34,7 +34,7 @@ class Project:
             if (root / "experiments" / "scales").is_dir():
                 parts.search(root)
                 return cls(root, results or root / "results")
-        raise RomnavError(f"{folder}: no experiments/ here or above; change to a copy of the romnav repository")
+        raise RomnavError(f"{folder}: no experiments/ here or above; change to a project, or make one by `romnav init`")
 
     @property
     def worlds(self) -> Path:

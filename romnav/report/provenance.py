@@ -14,9 +14,14 @@ def sources(files: Sequence[Provenance]) -> dict[str, str]:
     """Scale, commit and episode set of the files that a table is made of; several where they differ."""
     return {
         "scale": distinct(file.scale for file in files),
-        "commit": distinct(re.sub(r"(?<=^\w{12})\w+", "", file.commit) for file in files),
+        "commit": distinct(short(file.commit) for file in files),
         "episode_set": distinct(file.episode_set for file in files),
     }
+
+
+def short(commit: str) -> str:
+    """The first twelve digits of a commit, with "-dirty" where it was."""
+    return re.sub(r"(?<=^\w{12})\w+", "", commit)
 
 
 def training(files: Sequence[Provenance]) -> str:
@@ -31,4 +36,4 @@ def distinct(texts: Iterable[str]) -> str:
 
 def source(file: str | Path, provenance: Provenance) -> dict[str, Any]:
     """A file of rows, by its place under ``results/``, and where it comes from."""
-    return {"file": "/".join(Path(file).parts[-4:]), **provenance.model_dump()}
+    return {"file": "/".join(Path(file).parts[-4:]), **provenance.model_dump(exclude_unset=True)}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_serializer, field_validator, model_validator
 
 from romnav.config import Config
+from romnav.evaluation.spec import METRICS
 
 TableKind = Literal["performance", "success", "failures", "contrasts", "curves", "trials"]
 _CHOICES: dict[TableKind, set[str]] = {"curves": {"kind", "caption"}, "trials": {"kind"}}
@@ -35,7 +37,8 @@ class Column(Config):
     """A column of a table; the name of a metric alone stands for it as it is usually shown."""
 
     metric: str
-    """A metric of `romnav list metrics`, over all episodes or those of a level: "sr_120", "sr_120_cross"."""
+    """A metric of `romnav list metrics`, or one from outside as "pkg.mod:Name", over all episodes or those of a level:
+    "sr_120", "sr_120_cross"."""
     header: str = ""
     """Text above it; empty is the metric's label with level and unit."""
     bold: bool = True
@@ -45,6 +48,23 @@ class Column(Config):
     @classmethod
     def _named(cls, data: Any) -> Any:
         return {"metric": data} if isinstance(data, str) else data
+
+    @property
+    def outside(self) -> str | None:
+        """Name of the metric if it is from outside, without the level."""
+        name = re.sub("_(same|cross)$", "", self.metric)
+        return name if METRICS.outside(name) else None
+
+    @field_validator("metric")
+    @classmethod
+    def _there(cls, metric: str) -> str:
+        if name := cls.model_construct(metric=metric).outside:
+            METRICS.load(name)
+        return metric
+
+    @field_serializer("metric")
+    def _with_its_source(self, metric: str) -> str:
+        return f"{metric} {METRICS.stamped(self.outside)}" if self.outside else metric
 
 
 class TableSpec(Config):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shlex
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,20 @@ import pytest
 from romnav.evaluation.paired import rows
 from romnav.evaluation.trials import rows as trial_rows
 from romnav.experiment.graph import launch
+from romnav.files import digest
 from tests.cli.conftest import edit, fails, romnav
+
+
+def test_edited_rows_are_not_shown(evaluated: Path) -> None:
+    folder = evaluated / "results" / "smoke" / "rom" / "seed-0"
+    recorded = {"episodes.parquet": digest(folder / "episodes.parquet")}
+    (folder / "episodes.json").write_text(json.dumps({"key": "", "spec": {}, "outputs": recorded}))
+    assert romnav("results").exit_code == 0
+    shutil.copy(folder.parents[1] / "oracle" / "seed-0" / "episodes.parquet", folder / "episodes.parquet")
+    for words in (("results",), ("tables", "spawn-goal")):
+        result = romnav(*words)
+        assert result.exit_code == 1
+        assert "episodes.parquet: not the file that episodes.json recorded" in result.stderr.splitlines()[-1]
 
 
 def test_a_command_refuses_an_experiment_of_another_kind(project: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ from scipy.sparse.csgraph import connected_components
 
 from romnav.errors import RomnavError
 from romnav.evaluation import episodes
+from romnav.evaluation.paired import rows
 from romnav.evaluation.paired.run import run
+from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.evaluation.rollout import Oracle, Straight
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.experiment.kinds import episodes as kinds
+from romnav.experiment.kinds import reports
 from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.project import Project
@@ -24,6 +28,8 @@ from romnav.experiment.workspace import Workspace
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
 from romnav.navigation.train import train
+from romnav.report.paired.tables import build as build_table
+from romnav.report.spec import PAIRED
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
 from romnav.world.tiles.generate import generate
@@ -139,3 +145,24 @@ def test_a_part_of_another_kind_is_one_clear_line(
     broken = Workspace(Project(tmp_path, tmp_path / "results"), "smoke")
     with pytest.raises(RomnavError, match=f"parts.toml: arms.{arm}.{key}: {message}"):
         broken.arm_settings(arm)
+
+
+def test_a_table_shows_the_detours_of_successes(work: Workspace, episode_rows: Any) -> None:
+    """Ratios of sums, with intervals, over all episodes and over those across levels."""
+    experiment = work.project.experiment("parts")
+    (stage,) = [s for s in reports(work, "parts", [0]) if s.kind == "tables"]
+    assert "examples.detour:Detour@" in stage.spec["tables"]["parts"]["columns"][1]["metric"]
+    runs = [episode_rows(arm, skill) for arm, skill in {"maze": 0.5, "unicycle": 0.8}.items()]
+    spec = experiment.declared("parts", PAIRED).tables["parts"]
+    bootstrap = Bootstrap(rows.pair(runs), resamples=50, outside=["examples.detour:Detour"])
+    table = build_table("parts", spec, "Parts", bootstrap)
+    shown = {row.label: row.cells for block in table.blocks for row in block.rows}
+    assert "Detour: metres walked by successful robots" in table.caption
+    for evaluated, label in zip(runs, ("Half of the tiles mazes", "No sidesteps"), strict=True):
+        c = evaluated.columns
+        for k, level in ((1, np.ones(len(evaluated), bool)), (2, c["level"] == "cross")):
+            reached = (c["outcome"] == "success") & level
+            expected = c["path_length"][reached].sum() / c["geodesic"][reached].sum()
+            cell = shown[label][k]
+            assert cell.value == pytest.approx(expected)
+            assert cell.facts["lo"] < expected < cell.facts["hi"]

@@ -7,13 +7,15 @@ a resample of every metric.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import cache
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from romnav.evaluation import spec as specs
 from romnav.evaluation.paired.rows import HORIZONS, SUCCESS_RADIUS
 
 Level = Literal["all", "same", "cross"]
@@ -45,6 +47,25 @@ class Metric:
         return self.denominator == "episodes" and self.unit == "%"
 
 
+class Measure(Protocol):
+    """A metric from outside, with the attributes of a `Metric`."""
+
+    label: str
+    definition: str
+    scale: float
+    unit: str
+    better: Direction
+    decimals: int
+
+    def numerator(self, columns: Mapping[str, NDArray]) -> NDArray:
+        """What each episode adds to the sum above, of the shape of the columns."""
+        ...
+
+    def denominator(self, columns: Mapping[str, NDArray]) -> NDArray:
+        """What each episode adds to the sum below."""
+        ...
+
+
 def _rate(label: str, definition: str, numerator: str, better: Direction = "higher") -> Metric:
     return Metric(label, definition, numerator, scale=100.0, unit="%", better=better)
 
@@ -73,17 +94,33 @@ METRICS: dict[str, Metric] = {
 """Every metric of paired episodes by name."""
 
 
+def find(name: str) -> Metric:
+    """The metric of a name, be it one of ``METRICS`` or from outside."""
+    if name in METRICS:
+        return METRICS[name]
+    part = _load(name)
+    sums = f"{name} numerator", f"{name} denominator"
+    return Metric(part.label, part.definition, *sums, part.scale, part.unit, part.better, part.decimals)
+
+
+@cache
+def _load(name: str) -> Measure:
+    part: Measure = specs.METRICS.load(name)
+    return part
+
+
 def split(name: str) -> tuple[str, Level]:
     """Metric and level of a name: "sr_120" is of all episodes, "sr_120_cross" of those across levels."""
     metric, _, level = name.rpartition("_")
     return (metric, level) if level in ("same", "cross") else (name, "all")  # type: ignore[return-value]
 
 
-def quantities(columns: Mapping[str, NDArray]) -> dict[str, NDArray]:
+def quantities(columns: Mapping[str, NDArray], outside: Iterable[str] = ()) -> dict[str, NDArray]:
     """What each episode adds to the sums of the metrics.
 
     Args:
         columns: Columns of episode rows, of one common shape.
+        outside: Names of metrics from outside.
 
     Returns:
         Name to array of that shape.
@@ -106,6 +143,8 @@ def quantities(columns: Mapping[str, NDArray]) -> dict[str, NDArray]:
         "timeouts": (columns["outcome"] == "timeout").astype(float),
         "collisions": columns["collisions"].astype(float),
         "path": path,
+        **{f"{name} numerator": np.asarray(_load(name).numerator(columns), float) for name in outside},
+        **{f"{name} denominator": np.asarray(_load(name).denominator(columns), float) for name in outside},
     }
 
 

@@ -156,7 +156,7 @@ def pair(runs: Iterable[EpisodeRows]) -> list[Arm]:
     """Groups runs into arms (in order of first appearance) and checks that all saw the same episodes.
 
     Raises:
-        RomnavError: Two runs differ in episode set or in episodes, or one run is given twice.
+        RomnavError: Two runs differ in episode set, in episodes or in how they were evaluated; one is given twice.
     """
     runs = list(runs)
     groups: dict[str, dict[int, EpisodeRows]] = {}
@@ -178,6 +178,12 @@ def _same_episodes(a: EpisodeRows, b: EpisodeRows) -> None:
             f"{both}: rows of different episode sets, {a.provenance.episode_set} and "
             f"{b.provenance.episode_set}; evaluate both on the same set"
         )
+    for name, unit in (("duration", "s"), ("reach", "m")):
+        mine, other = getattr(a.provenance, name), getattr(b.provenance, name)
+        if None not in (mine, other) and mine != other:
+            raise RomnavError(
+                f"{both}: evaluated with a {name} of {mine} and {other} {unit}; evaluate both alike (evaluation.{name})"
+            )
     if len(a) != len(b):
         raise RomnavError(
             f"{both}: {len(a)} and {len(b)} episodes of set {a.provenance.episode_set}; evaluate the shorter one again"

@@ -8,8 +8,7 @@ product with the episodes' values: one matrix multiplication for every interval.
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from romnav.errors import RomnavError
-from romnav.evaluation.intervals import mcnemar_mid_p, resampled_sums
-from romnav.evaluation.paired.metrics import LEVELS, METRICS, Level, Metric, in_level, quantities
+from romnav.evaluation.intervals import mcnemar_mid_p, percentile_interval, resampled_sums
+from romnav.evaluation.paired.metrics import LEVELS, Level, Metric, find, in_level, quantities
 from romnav.evaluation.paired.rows import HORIZONS, Arm
 
 Cluster = Literal["episode", "tile"]
@@ -27,7 +26,7 @@ _DISJOINT: tuple[Level, ...] = ("same", "cross")
 
 @dataclass(frozen=True)
 class Estimate:
-    """A metric with its percentile bootstrap interval, over n episodes."""
+    """A metric with its percentile bootstrap interval, over n episodes; of very few there is none (NaN)."""
 
     value: float
     lo: float
@@ -78,6 +77,7 @@ class Bootstrap:
         cluster: Unit that is resampled. By episode compares with the paper; by tile allows for episodes of
             one tile being alike.
         confidence: Coverage of the intervals.
+        outside: Names of metrics from outside that will be asked for.
     """
 
     def __init__(
@@ -88,14 +88,16 @@ class Bootstrap:
         seed: int = 0,
         cluster: Cluster = "episode",
         confidence: float = 0.95,
+        outside: Collection[str] = (),
     ) -> None:
         if not arms:
             raise RomnavError("no arms to compare; evaluate at least one")
         self.arms = {arm.name: arm for arm in arms}
-        self._tails = (50 * (1 - confidence), 50 * (1 + confidence))
+        self._confidence = confidence
         columns = arms[0].runs[0].columns
         self._masks: dict[Level, NDArray] = {level: in_level(columns, level) for level in LEVELS}
-        self._runs = [(arm.name, quantities(run.columns)) for arm in arms for run in arm.runs]
+        self._units = {level: len(np.unique(columns[cluster][mask])) for level, mask in self._masks.items()}
+        self._runs = [(arm.name, quantities(run.columns, outside)) for arm in arms for run in arm.runs]
         parts = [self._masks[level] for level in _DISJOINT]
         values = np.array([[[v * part for part in parts] for v in q.values()] for _, q in self._runs])
         order = np.argsort(columns[cluster], kind="stable")
@@ -106,15 +108,15 @@ class Bootstrap:
         self._seed_weights = {arm.name: _seed_weights(arm, resamples, seed) for arm in arms}
 
     def metric(self, arm: str, metric: str, level: Level = "all") -> Estimate:
-        """A metric of ``METRICS`` for one arm, pooled over its training seeds."""
-        value, draws = self._ratio(arm, METRICS[metric], level)
-        return Estimate(value, *self._interval(draws), n=int(self._masks[level].sum()))
+        """A metric by name for one arm, pooled over its training seeds."""
+        value, draws = self._ratio(arm, find(metric), level)
+        return Estimate(value, *self._interval(draws, level), n=int(self._masks[level].sum()))
 
     def contrast(self, a: str, b: str, metric: str = f"sr_{HORIZONS[-1]}", level: Level = "all") -> Contrast:
-        """Difference of two arms in a metric of ``METRICS``."""
-        m = METRICS[metric]
+        """Difference of two arms in a metric."""
+        m = find(metric)
         (value_a, draws_a), (value_b, draws_b) = self._ratio(a, m, level), self._ratio(b, m, level)
-        interval, mask = self._interval(draws_a - draws_b), self._masks[level]
+        interval, mask = self._interval(draws_a - draws_b, level), self._masks[level]
         a_only = b_only = mid_p = None
         if m.is_rate and len(self.arms[a].runs) == len(self.arms[b].runs) == 1:
             quantity = dict(self._runs)  # one run each
@@ -135,13 +137,8 @@ class Bootstrap:
         with np.errstate(invalid="ignore", divide="ignore"):
             return float(metric.scale * value[0] / value[1]), metric.scale * draws[0] / draws[1]
 
-    def _interval(self, draws: NDArray) -> tuple[float, float]:
-        """Percentile interval of the resamples in which the statistic exists."""
-        draws = draws[np.isfinite(draws)]
-        if not len(draws):
-            return math.nan, math.nan
-        lo, hi = np.percentile(draws, self._tails)
-        return float(lo), float(hi)
+    def _interval(self, draws: NDArray, level: Level) -> tuple[float, float]:
+        return percentile_interval(draws, self._units[level], self._confidence)
 
 
 def _seed_weights(arm: Arm, resamples: int, seed: int) -> NDArray:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from romnav.evaluation.intervals import mcnemar_mid_p, resampled_sums, wilson
+from romnav.evaluation.intervals import mcnemar_mid_p, percentile_interval, resampled_sums, wilson
 from romnav.evaluation.trials.rows import TrialRows
 
 Event = Literal["success", "collision"]
@@ -76,10 +76,13 @@ def difference(rows: TrialRows, scene: str, event: Event, resamples: int = 10_00
     off, on = (_happened(rows, scene, filtered, event) for filtered in (False, True))
     each = on.astype(float) - off
     draws = 100.0 * resampled_sums(each, resamples) / len(each)
-    lo, hi = np.percentile(draws, (2.5, 97.5))
     on_only, off_only = int((on & ~off).sum()), int((off & ~on).sum())
     return Difference(
-        100.0 * float(each.mean()), float(lo), float(hi), on_only, off_only, mcnemar_mid_p(on_only, off_only)
+        100.0 * float(each.mean()),
+        *percentile_interval(draws, len(each)),
+        on_only,
+        off_only,
+        mcnemar_mid_p(on_only, off_only),
     )
 
 

@@ -19,9 +19,13 @@ from typing import Any
 
 from romnav import __version__
 from romnav.errors import RomnavError
-from romnav.experiment.graph.stage import Stage, digest
-from romnav.files import write
+from romnav.experiment.graph.stage import Stage
+from romnav.files import digest, write
 
+ROOT = Path(__file__).resolve().parents[3]
+"""Folder of the code, a repository's where it is not installed."""
+UNKNOWN = "unknown"
+"""Commit where git does not tell it."""
 _PACKAGES = ("torch", "rsl-rl-lib", "mujoco", "warp-lang", "numpy")
 
 
@@ -219,18 +223,21 @@ def _process() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Git commit of the code, with ``-dirty`` where code or experiments differ; "unknown" without git."""
-    root = Path(__file__).parents[3]
-    head = _git(root, "rev-parse", "HEAD")
-    changed = _git(root, "status", "--porcelain", "--", "romnav", "experiments/*.toml", "pyproject.toml")
-    return f"{head or 'unknown'}{'-dirty' if changed else ''}"
+    """Git commit of the code, with ``-dirty`` where code or experiments differ; where it is installed, its version."""
+    if not (ROOT / ".git").exists():
+        return f"v{__version__}"
+    head = _git("rev-parse", "HEAD")
+    changed = _git("status", "--porcelain", "--", "romnav", "experiments/*.toml", "pyproject.toml")
+    return f"{head}{'-dirty' if changed else ''}" if head else UNKNOWN
 
 
-def _git(root: Path, *arguments: str) -> str:
+def _git(*arguments: str) -> str:
+    """What git prints; nothing where it fails."""
     try:
-        return subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True).stdout.strip()
+        done = subprocess.run(["git", "-C", ROOT, *arguments], capture_output=True, text=True)
     except OSError:
         return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def _version(package: str) -> str:

@@ -118,7 +118,9 @@ def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None
     Raises:
         RomnavError: A stage cannot do or write what it should.
     """
-    records.provenance()  # looks up the commit now: another may be checked out before a long stage ends
+    # looked up now: another commit may be checked out before a long stage ends
+    if records.provenance()["commit"] == records.UNKNOWN:
+        say(f"{records.ROOT}: git does not tell the commit, recorded as unknown; see what `git status` says there")
     for stage in stages:
         changed = "; ".join(records.differences(stage))
         say(f"{stage.name} (changed: {changed})" if changed else stage.name)

@@ -14,6 +14,7 @@ from typing import Any
 
 from romnav.config import Config
 from romnav.errors import RomnavError
+from romnav.files import digest
 from romnav.progress import Progress
 
 
@@ -108,9 +109,3 @@ def _plain(settings: Config, name: str) -> Any:
     if last in type(section).model_fields:
         return section.model_dump(mode="json", include={last}).get(last)
     return getattr(section, last)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from romnav import __version__
+from romnav.evaluation.spec import EvaluationSpec, TrialSpec
 from romnav.experiment.graph import records
-from romnav.experiment.graph.stage import Stage, digest
+from romnav.experiment.graph.stage import Stage
 from romnav.experiment.kinds.locomotion import walking
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import DRIVERS, SCRIPTED
 from romnav.experiment.workspace import Workspace
+from romnav.files import digest
 
 if TYPE_CHECKING:
     from romnav.evaluation.rollout import Driver
@@ -86,7 +88,7 @@ class Driven:
         path = self.policy.folder / "policy.pt"
         return rollout.Policy(checkpoint.load_actor(path, seen.encoder, device, depth_encoder=depth), seen)
 
-    def provenance(self, stage: Stage, starts: str) -> Provenance:
+    def provenance(self, stage: Stage, starts: str, spec: EvaluationSpec | TrialSpec) -> Provenance:
         """Where the rows of a stage come from; ``starts`` is the hash of the initial conditions."""
         from romnav.evaluation.rowfile import Provenance
 
@@ -102,5 +104,7 @@ class Driven:
             episode_set=starts,
             version=__version__,
             machine=source["machine"],
+            duration=spec.duration,
+            reach=spec.reach,
             **facts,
         )

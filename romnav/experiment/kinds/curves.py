@@ -85,10 +85,11 @@ def read(work: Workspace, experiment: Experiment, runs: Sequence[Stage]) -> dict
 def tabulate(work: Workspace, name: str, table: str, arms: Mapping[str, Curves], runs: Sequence[Stage]) -> Table:
     """A declared table of the arms of finished training runs."""
     from romnav.report import curves
+    from romnav.report.provenance import distinct, short
 
     experiment = work.project.experiment(name)
-    made = [record.provenance["commit"][:12] for run in runs if (record := records.read(run))]
-    provenance = {"scale": work.scale, "commit": ", ".join(sorted(set(made)))}
+    made = distinct(short(record.provenance["commit"]) for run in runs if (record := records.read(run)))
+    provenance = {"scale": work.scale, "commit": made}
     sources = {arm: tuple(_source(run) for run in runs if run.arm == arm) for arm in arms}
     caption = experiment.tables[table].caption or f"{experiment.title}."
     return curves.tabulate(table, caption, arms, provenance, sources, work.project.published(name))

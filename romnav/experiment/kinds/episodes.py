@@ -88,7 +88,7 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
         **{name: values for name, values in paired.columns.items() if name in rows.SCHEMA.names},
         **measured,
     }
-    provenance = driven.provenance(stage, paired.digest)
+    provenance = driven.provenance(stage, paired.digest, settings.evaluation)
     rows.write(stage.folder / "episodes.parquet", rows.make(columns, provenance))
     source = {name: str(value) for name, value in provenance.model_dump().items()}
     write(stage.folder / "tracks.npz", recorder.tracks(count), source)

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
-from romnav.experiment.graph.stage import Session, Stage, digest
+from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.episodes import episodes
 from romnav.experiment.kinds.policy import frozen_encoders
 from romnav.experiment.workspace import Workspace
+from romnav.files import digest
 from romnav.progress import Progress
 
 if TYPE_CHECKING:

@@ -11,11 +11,12 @@ import numpy as np
 
 from romnav import files
 from romnav.errors import RomnavError
-from romnav.experiment.graph.stage import Session, Stage, digest
+from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import NOISE
 from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.workspace import Workspace
+from romnav.files import digest
 from romnav.progress import Progress
 
 EPISODES = "dev"
@@ -52,8 +53,10 @@ def kept(work: Workspace, arm: str, seed: int) -> Stage:
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
-    """The progress of the trained arms of an experiment, as a figure, where any was judged along its run."""
+    """The progress of the trained arms of an ablation, as a figure, where any was judged along its run."""
     experiment = work.project.experiment(name)
+    if experiment.kind != "ablation":
+        return []
     judged = {
         label: tuple(path for seed in seeds if (path := work.folder / arm / f"seed-{seed}" / "kept.csv").exists())
         for arm, label in experiment.labels.items()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -32,7 +32,7 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
     for table, spec in declared.tables.items():
         known = known_metrics(spec.kind)
         for column in spec.columns:
-            if column.metric not in known:
+            if column.metric not in known and not column.outside:
                 raise RomnavError(
                     f"{work.project.file(name)}: tables.{table}.columns: unknown metric {column.metric}"
                     f"{suggest(column.metric, known)}, see `romnav list metrics`"
@@ -63,7 +63,8 @@ def _write(
     from romnav.report import formats
     from romnav.report.paired import results, tables
 
-    bootstrap, published = Bootstrap(results.load(work.project.results, work.scale)), work.project.published(name)
+    arms, published = results.load(work.project.results, work.scale), work.project.published(name)
+    bootstrap = Bootstrap(arms, outside=_outside([declared]))
     built = []
     for table, spec in declared.tables.items():
         built.append(tables.build(table, spec, declared.title, bootstrap, published))
@@ -71,6 +72,12 @@ def _write(
     for made in built:  # all or none
         formats.write(made, stage.folder)
     return {}
+
+
+def _outside(declared: Iterable[Declared]) -> list[str]:
+    """Metrics from outside in the columns of tables."""
+    columns = (c for d in declared for table in d.tables.values() for c in table.columns)
+    return list(dict.fromkeys(c.outside for c in columns if c.outside))
 
 
 def evaluated(work: Workspace) -> list[Table]:
@@ -82,10 +89,11 @@ def evaluated(work: Workspace) -> list[Table]:
     from romnav.evaluation.paired.statistics import Bootstrap
     from romnav.report.paired import results, tables
 
-    bootstrap = Bootstrap(results.load(work.project.results, work.scale))
+    every = {name: experiment.declared(name, PAIRED) for name, experiment in work.project.experiments.items()}
+    bootstrap = Bootstrap(results.load(work.project.results, work.scale), outside=_outside(every.values()))
     built = []
-    for name, experiment in work.project.experiments.items():
-        declared, published = experiment.declared(name, PAIRED), work.project.published(name)
+    for name, declared in every.items():
+        published = work.project.published(name)
         for table, spec in declared.tables.items():
             if len(tables.evaluated(spec, bootstrap)) < 2:
                 continue

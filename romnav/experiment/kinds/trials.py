@@ -81,7 +81,7 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
         body=humanoid(driven.work, driven.seed, session.device, spec.threads) if walks else None,
         arms=settings.locomotion.robot if walks else None,
     )
-    provenance = driven.provenance(stage, draw(scenes, world, spec).digest)
+    provenance = driven.provenance(stage, draw(scenes, world, spec).digest, spec)
     rows.write(stage.folder / stage.outputs[0], rows.TrialRows(driven.arm, driven.seed, columns, provenance))
     return {}
 

@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any
 
 from romnav.errors import NothingRecorded
-from romnav.evaluation.paired.metrics import LEVELS, METRICS, Direction, Metric, split
+from romnav.evaluation.paired.metrics import LEVELS, METRICS, Direction, Metric, find, split
 from romnav.evaluation.paired.rows import HORIZONS
 from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.report.formats import Block, Cell, Row, Table, number
@@ -58,7 +58,7 @@ def known_metrics(kind: TableKind) -> list[str]:
 def meaning(metric: str) -> Metric | Cost:
     """What the name of a column stands for, at whichever level."""
     name = split(metric)[0]
-    return COSTS.get(name) or METRICS[name]
+    return COSTS.get(name) or find(name)
 
 
 def build(name: str, spec: TableSpec, title: str, bootstrap: Bootstrap, published: Published | None = None) -> Table:
@@ -140,7 +140,7 @@ def _performance(
                 return number(math.nan, cost.decimals)
             runs = [getattr(run.provenance, name) for run in bootstrap.arms[arm].runs]
             return number(cost.scale * sum(runs) / len(runs), cost.decimals)
-        decimals = METRICS[name].decimals
+        decimals = find(name).decimals
         if arm not in bootstrap.arms:
             return number(math.nan, decimals)
         estimate = bootstrap.metric(arm, name, level)
@@ -192,7 +192,7 @@ def _contrasts(
 ) -> tuple[_Blocks, _Blocks]:
     def measured(arm: str, column: Column) -> Cell:
         metric, level = split(column.metric)
-        decimals = METRICS[metric].decimals
+        decimals = find(metric).decimals
         if not {spec.reference.arm, arm} <= set(bootstrap.arms):
             return number(math.nan, decimals)
         c = bootstrap.contrast(spec.reference.arm, arm, metric, level)

@@ -160,7 +160,8 @@ def _difference(d: Difference) -> Cell:
         d.diff, 1, sign=True, dagger=d.lo > 0 or d.hi < 0,
         lo=d.lo, hi=d.hi, on_only=d.on_only, off_only=d.off_only, mid_p=d.mid_p,
     )  # fmt: skip
-    return Cell(cell.value, f"{cell.text} [{d.lo:+.1f}, {d.hi:+.1f}]", cell.facts, dagger=cell.dagger)
+    interval = f" [{d.lo:+.1f}, {d.hi:+.1f}]" if math.isfinite(d.lo) else ""
+    return Cell(cell.value, f"{cell.text}{interval}", cell.facts, dagger=cell.dagger)
 
 
 def _of(count: float, n: int) -> Cell:

@@ -156,6 +156,30 @@ def test_runs_that_cannot_be_compared(episode_rows, other: dict, message: str) -
         rows.pair([episode_rows("a"), episode_rows(**{"arm": "b", **other})])
 
 
+@pytest.mark.parametrize(("setting", "value"), [("duration", 45.0), ("reach", 1.0)])
+def test_arms_evaluated_with_other_settings_cannot_be_compared(episode_rows, setting: str, value: float) -> None:
+    usual = {"duration": 120.0, "reach": 0.5}
+    a, b, old = episode_rows("a", **usual), episode_rows("b", **{**usual, setting: value}), episode_rows("c")
+    assert len(rows.pair([a, episode_rows("b", **usual), old])) == 3
+    with pytest.raises(RomnavError, match=rf"a/seed-0 and b/seed-0: .* a {setting} of .*evaluation\.{setting}"):
+        rows.pair([a, b])
+
+
+def test_a_flipped_bit_is_found(episode_rows, tmp_path: Path) -> None:
+    path = tmp_path / "rows.parquet"
+    rows.write(path, episode_rows(n=256))
+    whole = path.read_bytes()
+    for place in range(4, len(whole) - 4, len(whole) // 40):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
+        try:
+            read = rows.read(path)
+        except RomnavError as error:
+            assert str(path) in str(error)  # noqa: PT017
+        else:  # not all of the footer is needed
+            for name, column in episode_rows(n=256).columns.items():
+                np.testing.assert_array_equal(read.columns[name], column)
+
+
 def test_episodes_of_one_set_must_agree(episode_rows) -> None:
     b = episode_rows("b")
     tile = b.columns["tile"].copy()

@@ -136,3 +136,13 @@ def test_training_seeds_are_resampled(episode_rows) -> None:
     np.testing.assert_allclose([a.lo, a.hi], theirs, atol=0.1 * (theirs[1] - theirs[0]))
     assert (c.a_only, c.b_only, c.mid_p) == (None, None, None)
     assert b.contrast("a", "a").hi == 0
+
+
+@pytest.mark.parametrize(("episodes", "sure"), [(1, False), (5, False), (6, True), (64, True)])
+def test_too_few_episodes_prove_nothing(episode_rows, episodes: int, sure: bool) -> None:
+    """Five that agree have a chance of one in sixteen."""
+    arms = rows.pair([episode_rows("a", 2.0, n=episodes), episode_rows("b", 0.0, n=episodes)])
+    contrast = Bootstrap(arms).contrast("a", "b")
+    assert contrast.diff == 100.0
+    assert contrast.significant == sure
+    assert np.isfinite(contrast.lo) == sure

@@ -49,7 +49,8 @@ def policy(file: Path, work: Workspace, seed: int) -> None:
 @pytest.fixture
 def work(tmp_path: Path) -> Workspace:
     (tmp_path / "experiments" / "episodes").mkdir(parents=True)
-    shutil.copy(ROOT / "experiments" / "spawn-goal.toml", tmp_path / "experiments")
+    for name in ("spawn-goal", "deploy"):
+        shutil.copy(ROOT / "experiments" / f"{name}.toml", tmp_path / "experiments")
     spec = EpisodeSetSpec(
         world=WorldSpec(tiles=2, seed=54, goals_per_tile=8),
         episodes=8,
@@ -86,6 +87,7 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     second.make(second, Session(), progress)
     assert len(walked) == 2 * once
     (figure,) = reports(work, "spawn-goal", [0])
+    assert not reports(work, "deploy", [0])  # it drives the same arm, but trains none
     assert [path.parts[-3:-1] for path in figure.reads] == [("rom", "seed-0")]
     figure.make(figure, Session(), progress)
     assert (work.folder / "figures" / "spawn-goal-progress.png").stat().st_size > 10_000

@@ -1,0 +1,45 @@
+"""Numbers in README and docs are those of results/."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "tools"))
+import numbers_in_pages as numbers  # noqa: E402
+
+
+def test_every_quoted_number_is_that_of_the_results() -> None:
+    assert not numbers.outdated(), "run `make numbers`"
+
+
+def test_numbers_are_read_from_json_csv_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numbers, "ROOT", tmp_path)
+    (tmp_path / "a.json").write_text(json.dumps({"of": [{"name": "x", "rate": 0.985}, {"name": "y", "rate": 1.0}]}))
+    (tmp_path / "t.csv").write_text('source,row,column,value\npaper,R,c,1\nours,"R, on",c,2.25\nours,"R, on",c,9\n')
+    (tmp_path / "t.md").write_text("| a |\n|---|\n| 1 |\n")
+    page = (
+        "Rates of <!-- = a.json of/name=x/rate 100*.3g -->?<!-- --> and <!-- = a.json of/name=y/rate .1f --><!-- -->, "
+        'or <!-- = t.csv "R, on" c .1f -->7<!-- -->.\n<!-- = t.md -->\nold\n<!-- -->\n'
+    )
+    text = numbers.written(page)
+    assert "rate 100*.3g -->98.5<!-- -->" in text
+    assert "rate .1f -->1.0<!-- -->," in text
+    assert "c .1f -->2.2<!-- -->." in text
+    assert "\n\n| a |\n|---|\n| 1 |\n\n<!-- -->" in text
+    assert "old" not in text
+    assert numbers.written(text) == text
+
+
+@pytest.mark.parametrize("source", ["gone.json x .1f", "a.json y .1f", "a.json x", "t.txt x .1f", "kept nowhere"])
+def test_a_source_that_is_not_there_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
+    monkeypatch.setattr(numbers, "ROOT", tmp_path)
+    (tmp_path / "a.json").write_text('{"x": 1}')
+    with pytest.raises(numbers.SourceError, match=source.split()[0]):
+        numbers.written(f"<!-- = {source} -->1<!-- -->")
+    with pytest.raises(numbers.SourceError, match="has no"):
+        numbers.written("<!-- = a.json x .1f -->1")

@@ -1,0 +1,118 @@
+"""Writes numbers and tables of results/ into the Markdown that quotes them: `make numbers`.
+
+A quoted number stands between two comments, of which the first tells where it comes from:
+
+    <!-- = results/bench/lidar-paper.json ours .0f -->411<!-- -->
+    <!-- = results/cpu/locomotion/terrain.json terrain=ramp/crossed 100*.3g -->100<!-- -->
+    <!-- = results/smoke/tables/safety.csv "In-Distribution, CBF" collision .3g -->0<!-- -->
+
+A key of JSON leads through objects by name and through lists by a field that has a value; a row and a column lead to
+our first number in a table's CSV. The last word formats the number, times 100 if it begins so. A whole table is
+
+    <!-- = results/smoke/tables/safety.md -->
+    <!-- -->
+
+and `kept SCALE` in place of a file is the table of the policies kept along the runs of a scale, as judged on dev.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")))
+QUOTED = re.compile(r"(<!-- = (?P<source>[^\n]+?) -->)(?P<shown>.*?)(<!-- -->)", re.DOTALL)
+KEPT = {
+    "sr_45_all": "SR@45", "sr_45_same": "same level", "sr_45_cross": "cross level",
+    "sr_120_all": "SR@120", "sr_120_same": "same level", "sr_120_cross": "cross level",
+}  # fmt: skip
+
+
+class SourceError(Exception):
+    """A comment names nothing that is there."""
+
+
+def value(source: str) -> str:
+    """What a comment says that stands behind it.
+
+    Raises:
+        SourceError: There is no such file, key or format.
+    """
+    try:
+        file, *keys = shlex.split(source)
+        if file == "kept":
+            return f"\n\n{_kept(*keys)}\n\n"
+        path = ROOT / file
+        if path.suffix == ".md":
+            return f"\n\n{path.read_text('utf-8').strip()}\n\n"
+        *keys, form = keys
+        number = {".json": _of_json, ".csv": _of_csv}[path.suffix](path, *keys)
+        factor, form = (100, form.removeprefix("100*")) if form.startswith("100*") else (1, form)
+        return f"{factor * number:{form}}"
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SourceError(f"{source}: {error}") from error
+
+
+def _of_json(path: Path, keys: str) -> float:
+    found: Any = json.loads(path.read_text("utf-8"))
+    for key in keys.split("/"):
+        name, _, wanted = key.partition("=")
+        found = next(item for item in found if str(item[name]) == wanted) if wanted else found[name]
+    return float(found)
+
+
+def _of_csv(path: Path, row: str, column: str) -> float:
+    with path.open(encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            if (line["source"], line["row"], line["column"]) == ("ours", row, column):
+                return float(line["value"])
+    raise KeyError(f"no {row}, {column}")
+
+
+def _kept(scale: str) -> str:
+    lines = ["| arm | steps | " + " | ".join(KEPT.values()) + " | SPL |", "|---" * (len(KEPT) + 3) + "|"]
+    rows = []
+    for path in (ROOT / "results" / scale).glob("*/seed-*/kept.csv"):
+        with path.open(encoding="utf-8") as file:
+            rows += [(int(row["steps"]), path.parts[-3], row) for row in csv.DictReader(file)]
+    if not rows:
+        raise KeyError(f"no kept policies at {scale}")
+    for steps, arm, row in sorted(rows, key=lambda found: found[:2]):
+        rates = " | ".join(f"{float(row[key]):.1f}" for key in KEPT)
+        lines.append(f"| {arm} | {steps / 1e6:.1f} M | {rates} | {float(row['spl']):.3f} |")
+    return "\n".join(lines)
+
+
+def written(text: str) -> str:
+    """A page with the numbers that its comments name.
+
+    Raises:
+        SourceError: A comment names nothing that is there, or does not end.
+    """
+    if text.count("<!-- = ") != len(QUOTED.findall(text)):
+        raise SourceError("a comment that begins with `<!-- = ` has no `<!-- -->` behind it")
+    return QUOTED.sub(lambda found: found[1] + value(found["source"]) + found[4], text)
+
+
+def outdated() -> list[Path]:
+    """Pages whose numbers are not those of the results.
+
+    Raises:
+        SourceError: A comment on a page names nothing that is there.
+    """
+    return [page for page in PAGES if written(text := page.read_text("utf-8")) != text]
+
+
+if __name__ == "__main__":
+    try:
+        for page in outdated():
+            page.write_text(written(page.read_text("utf-8")), "utf-8")
+            print(page)
+    except SourceError as error:
+        sys.exit(f"error: {error}")
