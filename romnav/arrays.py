@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,22 +34,25 @@ def save(path: Path, arrays: Mapping[str, NDArray], facts: Any) -> None:
     types = {dtype: name for name, dtype in NAMES.items()}
     # widest elements first: so all of them lie aligned, without the gaps that the format forbids
     order = sorted(arrays, key=lambda name: -arrays[name].itemsize)
-    header: dict[str, Any] = {"__metadata__": {"facts": json.dumps(facts)}}
+    metadata = {"facts": json.dumps(facts)}
+    header: dict[str, Any] = {"__metadata__": metadata}
     end = 0
     for name in order:
         array = arrays[name]
         begin, end = end, end + array.nbytes
         header[name] = {"dtype": types[array.dtype], "shape": array.shape, "data_offsets": [begin, end]}
+    parts = [np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data for name in order]
+    metadata["crc32"] = _checksum(header, parts)
     text = json.dumps(header).encode()
     text += b" " * (-(8 + len(text)) % ALIGNMENT)
     with files.atomic(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
-        for name in order:
-            file.write(np.ascontiguousarray(arrays[name]).data)
+        for part in parts:
+            file.write(part)
 
 
 def load(path: Path) -> tuple[dict[str, NDArray], Any] | None:
-    """The arrays and facts of a file, or None where it is missing, torn or another format.
+    """The arrays and facts of a file, or None where it is missing, torn, altered or another format.
 
     Arrays are pages of the file, shared with other processes; who writes to one writes to a copy of its page.
     """
@@ -56,6 +60,9 @@ def load(path: Path) -> tuple[dict[str, NDArray], Any] | None:
         data = np.memmap(path, np.uint8, "c")
         start = 8 + int.from_bytes(data[:8].tobytes(), "little")
         header = json.loads(data[8:start].tobytes())
+        checksum = header["__metadata__"].pop("crc32")
+        if checksum != _checksum(header, [data[start:]]):
+            return None
         facts = json.loads(header.pop("__metadata__")["facts"])
         arrays = {}
         for name, entry in header.items():
@@ -66,3 +73,11 @@ def load(path: Path) -> tuple[dict[str, NDArray], Any] | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     return arrays, facts
+
+
+def _checksum(header: Mapping[str, Any], parts: Iterable[Any]) -> str:
+    """CRC-32 of a header without its checksum and of the bytes behind it."""
+    total = zlib.crc32(json.dumps(header).encode())
+    for part in parts:
+        total = zlib.crc32(part, total)
+    return f"{total:08x}"

@@ -6,6 +6,8 @@ import importlib
 import json
 import math
 import os
+import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -110,3 +112,51 @@ def test_simulated_stages_keep_order_and_bounds(common: ModuleType, drawn: Any, 
     assert work == pytest.approx(sum(lasts.values()))
     assert end >= max(max(path.values()), work / cores) - 1e-6
     assert end <= work / cores + (1 - 1 / cores) * max(path.values()) + 1e-6
+
+
+@pytest.mark.parametrize("kind", ["policy or checkpoint", "world", "episode set", "tracks", "record", "experiment"])
+def test_damaged_files_are_told_apart_by_what_readers_make_of_them(
+    common: ModuleType, tmp_path: Path, kind: str
+) -> None:
+    damage = importlib.import_module("_damage")
+    found = {damage._try(kind, n, tmp_path) for n in range(8)}
+    assert "refused" in found
+    assert found <= {"refused", "unharmed", "another"}
+
+
+def test_the_guarantee_counts_collisions(common: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    guarantee = importlib.import_module("_guarantee")
+    monkeypatch.setattr(guarantee, "WORLDS", 8)
+    closest, way = guarantee.batch(1, 1)
+    assert closest > 0.0
+    assert way > 1.0
+
+    class Careless:
+        def __init__(self, *told: Any, **more: Any) -> None:
+            pass
+
+        def __call__(self, points: torch.Tensor, velocity: torch.Tensor) -> SimpleNamespace:
+            return SimpleNamespace(velocity=velocity)
+
+    monkeypatch.setattr(guarantee, "SafetyFilter", Careless)
+    assert guarantee.batch(1, 1)[0] < 0.0
+
+
+def test_faults_are_counted_over_several_calls(
+    common: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = importlib.import_module("faults")
+    tried: list[int] = []
+
+    def damage(kind: str, trials: range, folder: Path) -> Counter[str]:
+        tried.extend(trials)
+        return Counter(refused=len(trials) - 1, another=1)
+
+    monkeypatch.setattr(faults._damage, "damage", damage)
+    monkeypatch.setattr(faults._damage, "FILES", {"tracks": faults._damage.FILES["tracks"]})
+    monkeypatch.setattr("sys.argv", ["faults.py", "--kills", "0", "--warp", "0", "--worlds", "0", "--damages", "5"])
+    monkeypatch.setattr("sys.argv", [*sys.argv, "--out", str(tmp_path)])
+    faults.main()
+    faults.main()
+    assert tried == list(range(10))
+    assert "| tracks | 10 | 8 | 0 | 2 | 0 | 0 |" in (tmp_path / "faults.md").read_text()

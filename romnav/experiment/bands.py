@@ -25,8 +25,12 @@ def check(collected: Mapping[str, Any], file: Path) -> list[str]:
         RomnavError: A metric is missing or outside of its band, or the file cannot be read.
     """
     try:
-        bands = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
+        told = json.loads(file.read_text("utf-8"))
+        bands = {
+            arm: {metric: (float(low), float(high)) for metric, (low, high) in metrics.items()}
+            for arm, metrics in told.items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise RomnavError(f"{file}: no readable file of bands ({error})") from error
     lines, failed = [], []
     for arm, metrics in bands.items():
@@ -35,7 +39,7 @@ def check(collected: Mapping[str, Any], file: Path) -> list[str]:
             values = [run[metric] for run in runs if run.get(metric) is not None]
             value = fmean(values) if values else None
             shown = "missing" if value is None else f"{value:.4g}"
-            line = f"{arm} {metric} {shown}, band {low} to {high}"
+            line = f"{arm} {metric} {shown}, band {low:g} to {high:g}"
             lines.append(line)
             if value is None or not low <= value <= high:
                 failed.append(line)

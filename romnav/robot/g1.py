@@ -216,9 +216,8 @@ class Robots(ABC):
         self.lost = torch.zeros(count, dtype=torch.bool)
 
     def stand_on(self, ground: Tensor) -> None:
-        """Robots are on grounds (n,) from now on."""
+        """Robots are on grounds (n,) from their next state or step on."""
         self.ground = ground.clone()
-        self._derive()
 
     def _surround(self, pelvis: NDArray[np.float64]) -> NDArray[np.int64]:
         """Hold, in the model of every robot with its pelvis at (n, 3), what is within its reach; whose has changed."""

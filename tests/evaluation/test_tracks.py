@@ -77,3 +77,22 @@ def test_damaged_files_are_refused_and_run_nothing(recorded: tuple, tmp_path: Pa
             torch.save({"first": [0]}, path)
     with pytest.raises(RomnavError, match=r"tracks\.npz.*evaluate the arm again"):
         tracks.read(path)
+
+
+def test_a_flipped_bit_is_refused_or_does_no_harm(recorded: tuple, tmp_path: Path) -> None:
+    path, luck = tmp_path / "tracks.npz", np.random.default_rng(0)
+    tracks.write(path, recorded[0], {"arm": "oracle"})
+    whole = path.read_bytes()
+    refused = 0
+    for where in luck.integers(len(whole), size=150):
+        flipped = bytearray(whole)
+        flipped[where] ^= 1 << int(luck.integers(8))
+        path.write_bytes(flipped)
+        try:
+            read, about = tracks.read(path)
+        except RomnavError:
+            refused += 1
+        else:
+            assert np.array_equal(read.position, recorded[0].position)
+            assert about == {"arm": "oracle"}
+    assert refused > 100

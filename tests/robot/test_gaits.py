@@ -10,7 +10,7 @@ import torch
 from romnav.errors import RomnavError
 from romnav.robot.g1 import Humanoids
 from romnav.robot.gaits import Gait, GaitLibrary, move
-from romnav.robot.locomotion.task import Controller
+from romnav.robot.locomotion.control import Controller
 from romnav.robot.locomotion.terrain import Ground, flat
 from romnav.robot.spec import LocomotionSpec
 

@@ -9,7 +9,7 @@ import torch
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp comes with the extra: pip install romnav[cuda]")
 
 from romnav.robot.g1 import Humanoids, Robots
-from romnav.robot.locomotion.task import Controller
+from romnav.robot.locomotion.control import Controller
 from romnav.robot.locomotion.terrain import Ground, flat, stairs
 from romnav.robot.spec import LocomotionSpec
 from romnav.robot.statics import Geoms

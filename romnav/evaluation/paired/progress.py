@@ -35,7 +35,7 @@ def read(path: Path) -> list[dict[str, str]]:
     """Rows of an earlier judgement; none where there is no such file, or one with other columns."""
     if not path.exists():
         return []
-    reader = csv.DictReader(io.StringIO(path.read_text("utf-8")))
+    reader = csv.DictReader(io.StringIO(path.read_text("utf-8", errors="replace")))
     return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
 
 

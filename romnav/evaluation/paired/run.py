@@ -16,6 +16,9 @@ from romnav.robot.rom import ReducedOrderModel
 from romnav.threads import torch_threads
 from romnav.world.world import World
 
+BUSY = 0.75
+"""Share of the rows that run at least: dropping the others costs copies, so it is not done at once."""
+
 
 @torch.inference_mode()
 def run(
@@ -65,8 +68,7 @@ def _run(
         if recorder:
             recorder.add(view, outcomes.alive())
         outcomes.add(before)
-        # dropping rows costs copies: do it once a quarter of the batch is idle
-        if 0 < outcomes.left < 0.75 * len(view.episode):
+        if 0 < outcomes.left < BUSY * len(view.episode):
             keep = outcomes.alive().nonzero()[:, 0]
             view.select(keep)
             driver.select(keep)

@@ -83,9 +83,9 @@ def _draw(judged: Mapping[str, tuple[Path, ...]], stage: Stage, session: Session
     """Of the mean over training seeds at each number of steps."""
     import pandas as pd
 
-    from romnav.report.paired.progress import draw
+    from romnav.report.paired.progress import draw, read
 
-    frames = {label: pd.concat([pd.read_csv(path) for path in paths]) for label, paths in judged.items()}
+    frames = {label: pd.concat([read(path) for path in paths]) for label, paths in judged.items()}
     means = {label: frame.groupby("steps", as_index=False).mean(numeric_only=True) for label, frame in frames.items()}
     draw(means, stage.folder / stage.outputs[0])
     return {}

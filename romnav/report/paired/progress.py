@@ -10,6 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from romnav.errors import RomnavError
 from romnav.report.formats import literal
 
 COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b")
@@ -25,6 +26,19 @@ def slope(steps: pd.Series, rate: pd.Series) -> float:
     if len(steps) < 2:
         return float("nan")
     return float(np.polyfit(np.log2(steps.to_numpy(float)), rate.to_numpy(float), 1)[0])
+
+
+def read(path: Path) -> pd.DataFrame:
+    """Rows of ``kept.csv``.
+
+    Raises:
+        RomnavError: The file is damaged.
+    """
+    try:
+        rows = pd.read_csv(path)
+        return rows.astype({name: float for name in rows.columns if name.startswith(("sr_", "steps"))})
+    except (OSError, ValueError) as error:
+        raise RomnavError(f"{path}: damaged ({error}); delete it and judge the kept policies again") from error
 
 
 def draw(arms: Mapping[str, pd.DataFrame], path: Path) -> None:

@@ -6,7 +6,9 @@ import mujoco
 import torch
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.robot.g1 import LEG, SIDES
+from romnav.robot.locomotion.inverse import Six, gauss_newton
 
 STRAIGHT = 0.15
 """Knee angle of the longest leg that the inverse kinematics asks for, rad: short of the singularity."""
@@ -58,8 +60,13 @@ class Legs:
         self._axis = torch.eye(4)[axes][..., None]
         self.limits = torch.tensor(limits, dtype=torch.float32)
         straight = torch.tensor([0.0, 0.0, 0.0, STRAIGHT, 0.0, 0.0]).expand(1, 2, 6)
-        self._hip = self._fixed[:, 0, :3, 3]
-        self._reach = (self.forward(straight)[0] - self._hip).norm(dim=-1, keepdim=True)
+        reach = (self.forward(straight)[0] - self._fixed[:, 0, :3, 3]).norm(dim=-1)[0]
+        self._chain = [
+            wp.from_torch(self._fixed, dtype=wp.mat44),
+            wp.from_torch(torch.tensor(axes, dtype=torch.int32)),
+            wp.from_torch(self.limits, dtype=wp.vec2),
+            wp.from_torch(reach),
+        ]
 
     def forward(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ankle position (n, 2, 3), rotation (n, 2, 3, 3) and the Jacobian (n, 2, 6, 6) of (position, rotation)."""
@@ -87,17 +94,13 @@ class Legs:
             iterations: Gauss-Newton steps.
             damping: Levenberg weight.
         """
-        joints = start
-        # Beyond the reach of the leg Gauss-Newton swings to and fro: shorten the way to the hip first.
-        leg = position - self._hip
-        position = self._hip + leg * (self._reach / leg.norm(dim=-1, keepdim=True)).clamp(max=1.0)
-        eye = damping * torch.eye(6)
-        for _ in range(iterations):
-            at, rot, jacobian = self.forward(joints)
-            # Rotation error as a vector: half the sum of the cross products of the axes.
-            twist = 0.5 * torch.linalg.cross(rot, turn, dim=-2).sum(-1)
-            error = torch.cat([position - at, twist], dim=-1)
-            jt = jacobian.transpose(-1, -2)
-            step = torch.linalg.solve(jt @ jacobian + eye, (jt @ error[..., None]))[..., 0]
-            joints = (joints + step.clamp(-0.5, 0.5)).clamp(self.limits[..., 0], self.limits[..., 1])
+        joints = start.clone(memory_format=torch.contiguous_format)
+        inputs = [
+            wp.from_torch(position.contiguous(), dtype=wp.vec3),
+            wp.from_torch(turn.contiguous(), dtype=wp.mat33),
+            *self._chain,
+            iterations,
+            damping,
+        ]
+        wp.launch(gauss_newton, joints.shape[:2], inputs, [wp.from_torch(joints, dtype=Six)], device="cpu")
         return joints

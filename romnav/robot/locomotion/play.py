@@ -12,8 +12,8 @@ import torch
 
 from romnav.errors import RomnavError
 from romnav.robot.g1 import Humanoids
+from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.evaluate import Row, rows
-from romnav.robot.locomotion.task import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.terrain import Ground, steer
 from romnav.robot.locomotion.train import load_policy
 
@@ -51,11 +51,14 @@ def curve(table: Path, path: Path) -> Path:
         path: PNG to write.
 
     Raises:
-        RomnavError: There is no curve.
+        RomnavError: There is no curve, or a damaged one.
     """
     if not table.exists():
         raise RomnavError(f"{table}: no training curve; train with `romnav train locomotion`")
-    rows = pd.read_csv(table)
+    try:
+        rows = pd.read_csv(table).astype(float)
+    except (OSError, ValueError) as error:
+        raise RomnavError(f"{table}: damaged, or no training curve ({error}); restore it") from error
     # Some hundred points: single iterations end only a few episodes of a kind.
     rows = rows.groupby(np.arange(len(rows)) // max(1, len(rows) // 120)).mean()
     figure, (levels, falls) = plt.subplots(1, 2, figsize=(11, 3.6))

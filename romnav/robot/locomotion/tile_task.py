@@ -8,7 +8,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from romnav.robot.g1 import Humanoids
-from romnav.robot.locomotion.task import WalkingEnv, heading_of
+from romnav.robot.locomotion.control import heading_of
+from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.spec import LocomotionSpec
 from romnav.robot.tiles import TileHeights, change_layer, geoms
 from romnav.world.geodesic import UNIT

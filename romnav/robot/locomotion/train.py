@@ -21,7 +21,8 @@ from torch import Tensor
 from romnav import files, stopping
 from romnav.errors import RomnavError
 from romnav.progress import Progress
-from romnav.robot.locomotion.task import LocomotionEnv, WalkingEnv
+from romnav.robot.locomotion.lane_task import LocomotionEnv
+from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.spec import LocomotionSpec, PpoSpec

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,9 @@ from tensordict import TensorDict
 
 from romnav.evaluation import episodes
 from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.paired import run as paired_run
 from romnav.evaluation.paired.run import run
-from romnav.evaluation.rollout import Oracle, Policy, Straight, View
+from romnav.evaluation.rollout import Driver, Oracle, Policy, Straight, View
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import EnvSpec, PolicySpec
@@ -98,6 +101,19 @@ def test_memory_follows_its_episode_when_finished_ones_are_dropped(world: World,
             v.robot.step(command)
             v.previous, v.step = command, step + 1
     torch.testing.assert_close(view.robot.position[half], part.robot.position, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("drive", [Straight, policy])
+def test_rows_are_the_same_whether_finished_ones_are_dropped_or_not(
+    world: World, paired: EpisodeSet, monkeypatch: pytest.MonkeyPatch, drive: Callable[[], Driver]
+) -> None:
+    short = EvaluationSpec(duration=20.0, reach=10.0)
+    dropped = run(drive(), world, paired, EnvSpec(), short)
+    monkeypatch.setattr(paired_run, "BUSY", 0.0)
+    kept = run(drive(), world, paired, EnvSpec(), short)
+    assert (dropped["outcome"] == "success").mean() > 0.25  # some were dropped
+    for key, column in kept.items():
+        assert np.array_equal(column, dropped[key], equal_nan=column.dtype.kind == "f"), key
 
 
 def test_measures_of_a_robot_that_stands_still(world: World, paired: EpisodeSet) -> None:

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from romnav.robot.g1 import Humanoids
-from romnav.robot.locomotion.legs import Legs, rotation
+from romnav.robot.g1 import SIDES, Humanoids
+from romnav.robot.locomotion.legs import STRAIGHT, Legs, rotation
 from romnav.robot.spec import RobotSpec
 from romnav.robot.statics import NOTHING
 
@@ -59,6 +59,29 @@ def test_inverse_finds_the_pose(legs: Legs, offsets: list[float]) -> None:
     at, as_turned, _ = legs.forward(found)
     assert (at - position).abs().max() < 2e-3
     assert (as_turned - turn).abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 6])
+def test_the_kernel_takes_the_steps_of_gauss_newton(robots: Humanoids, legs: Legs, iterations: int) -> None:
+    """Against the same by tensor operations; some poses beyond reach, some joints at their limits."""
+    generator = torch.Generator().manual_seed(0)
+    start, goal = (BENT + 0.3 * torch.randn(2, 50, 2, 6, generator=generator)).clamp(*legs.limits.unbind(-1))
+    position, turn, _ = legs.forward(goal)
+    position[:10] *= 1.3
+    bodies = [robots.model.body(f"{side}_hip_pitch_link") for side in SIDES]
+    hip = torch.tensor(np.array([body.pos for body in bodies]), dtype=torch.float32)
+    longest = (legs.forward(torch.tensor([0.0, 0.0, 0.0, STRAIGHT, 0.0, 0.0]).expand(1, 2, 6))[0] - hip).norm(dim=-1)
+    way = position - hip
+    near = hip + way * (longest / way.norm(dim=-1)).clamp(max=1.0)[..., None]
+    expected = start
+    for _ in range(iterations):
+        at, turned, jacobian = legs.forward(expected)
+        twist = 0.5 * torch.linalg.cross(turned, turn, dim=-2).sum(-1)
+        error = torch.cat([near - at, twist], dim=-1)[..., None]
+        square = jacobian.mT @ jacobian + 2e-4 * torch.eye(6)
+        step = torch.linalg.solve(square, jacobian.mT @ error)[..., 0]
+        expected = (expected + step.clamp(-0.5, 0.5)).clamp(*legs.limits.unbind(-1))
+    torch.testing.assert_close(legs.inverse(position, turn, start, iterations=iterations), expected, atol=1e-3, rtol=0)
 
 
 def test_what_cannot_be_reached_is_approached_within_the_limits(legs: Legs) -> None:

@@ -1,0 +1,156 @@
+"""From a velocity command and a policy's residual to joint targets, and from a state to the policy's observation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from romnav.robot.g1 import JOINTS, Robots
+from romnav.robot.locomotion.legs import Legs
+from romnav.robot.locomotion.lip import Reference, Walker, turn_xy, wrap
+from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, reflect
+from romnav.robot.locomotion.terrain import Heights
+from romnav.robot.spec import LocomotionSpec
+
+SCAN = tuple((x, y) for y in (-0.15, 0.15) for x in np.linspace(-0.4, 1.0, 15))
+"""Height scan ahead of and beside the pelvis in the heading frame, m."""
+TARGETS = len(JOINTS)
+
+
+def heading_of(orientation: Tensor) -> Tensor:
+    """Yaw (n,) of rotations (n, 3, 3)."""
+    return torch.atan2(orientation[:, 1, 0], orientation[:, 0, 0])
+
+
+def has_fallen(robots: Robots) -> Tensor:
+    """(n,) pelvis less than 0.42 m over the lower foot, or tipped by more than about 55 degrees; or lost."""
+    up = robots.pelvis[:, 2] - robots.ankle[..., 2].amin(1) >= 0.42
+    finite = robots.joint_velocity.isfinite().all(1) & robots.velocity.isfinite().all(1)
+    return ~(up & (robots.orientation[:, 2, 2] >= 0.57) & finite) | robots.lost
+
+
+class Controller:
+    """What turns a velocity command and a policy's residual into joint targets, and a state into an observation.
+
+    Training, evaluation, the gait library and the navigation stage all walk through this one class.
+    """
+
+    def __init__(self, spec: LocomotionSpec, robots: Robots) -> None:
+        self.spec, self.robots = spec, robots
+        self.dt = spec.robot.timestep * spec.robot.decimation
+        self.legs = Legs(robots.model)
+        self.walker = Walker(spec.gait, self.legs, self.dt, robots.count)
+        self.action = torch.zeros(robots.count, TARGETS)
+        self._scan = torch.tensor(SCAN, dtype=torch.float32)
+        self._rest = torch.cat([self.walker.stance().reshape(12), torch.zeros(3)])
+
+    def stand(self, ids: Tensor, position: Tensor, heading: Tensor, clock: Tensor, command: Tensor) -> None:
+        """Put robots `ids` on their feet at `position` (k, 3) (the ground's height), beginning a step.
+
+        They start with the sideways velocity the gait has at the beginning of a step, and half the commanded one.
+        """
+        k, gait = len(ids), self.spec.gait
+        half = torch.stack([torch.cos(heading / 2), torch.zeros(k), torch.zeros(k), torch.sin(heading / 2)], dim=1)
+        lift = position + torch.tensor([0.0, 0.0, gait.pelvis + 0.003])
+        qpos = torch.cat([lift, half, self._rest.expand(k, -1)], dim=1)
+        side = torch.where(clock < gait.step_ticks, 1.0, -1.0)
+        w = self.walker.w
+        sway = side * gait.width / 2 * w * np.tanh(w * self.walker.duration / 2)
+        start = 0.5 * command[:, :2].clamp(-0.5, 0.5)
+        velocity = start + torch.stack([torch.zeros(k), sway], dim=1)
+        qvel = torch.zeros(k, 6 + TARGETS)
+        qvel[:, :2] = turn_xy(velocity, heading)
+        self.robots.set_state(ids, qpos, qvel)
+        self.walker.reset(ids, clock, heading, start)
+        self.action[ids] = 0.0
+
+    def refer(self, command: Tensor, ground: Heights, first: Tensor) -> Reference:
+        """Reference of this control step, (n,) `first` for robots just placed."""
+        self.reference = self.walker.update(self.robots, command, ground, first=first)
+        return self.reference
+
+    def act(self, action: Tensor, ids: Tensor | None = None) -> None:
+        """Step robots with residual actions (n, 15) as seen in the mirror of `observe`; all, or only `ids`."""
+        self.action = reflect(action.clamp(-4.0, 4.0), ACTION_MIRROR, self.reference.side)
+        target = self.spec.task.action_scale * self.action
+        target[:, :12] += self.reference.joints.flatten(1) + self.reference.torque.flatten(1) / self.robots.kp[:12]
+        self.robots.step(target, ids)
+
+    def observe(self, command: Tensor, ground: Heights) -> Tensor:
+        """Observation (n, d) of the policy, mirrored (by `MIRROR`) while the right foot stands.
+
+        The policy always sees itself standing on the left foot, so it is left-right symmetric by construction
+        and learns one step instead of two.
+        """
+        r, ref = self.robots, self.reference
+        yaw = heading_of(r.orientation)
+        angle = 2 * torch.pi * (ref.phase + (ref.side < 0)) / 2
+        local = turn_xy(r.com_velocity[:, :2], -yaw)
+        feet = torch.cat([turn_xy((ref.sole - r.pelvis[:, None])[..., :2], -yaw[:, None]),
+                          (ref.sole - r.pelvis[:, None])[..., 2:]], dim=-1)  # fmt: skip
+        goal = ref.sole.clone()
+        goal[torch.arange(len(yaw)), (ref.side > 0).long()] = ref.foothold
+        goal = goal - ref.sole
+        goal = torch.cat([turn_xy(goal[..., :2], -yaw[:, None]), goal[..., 2:]], dim=-1)
+        points = r.pelvis[:, None, :2] + turn_xy(self._scan.expand(len(yaw), -1, -1), yaw[:, None])
+        level = ref.sole[..., 2].amin(1)
+        scan = ground(points, (level + 0.8)[:, None]) - level[:, None]
+        seen = torch.cat(
+            [
+                command,
+                torch.stack([torch.sin(angle), torch.cos(angle)], dim=1),
+                r.orientation[:, 2],
+                0.25 * r.spin,
+                local,
+                5.0 * (r.pelvis[:, 2] - ref.height)[:, None],
+                wrap(ref.heading - yaw)[:, None],
+                r.joints - self._rest,
+                0.05 * r.joint_velocity,
+                self.action,
+                ref.joints.flatten(1) - self._rest[:12],
+                feet.flatten(1),
+                goal.flatten(1),
+                scan.clamp(-1.0, 1.0),
+            ],
+            dim=1,
+        )
+        return reflect(seen, MIRROR, ref.side)
+
+    def snapshot(self, ids: Tensor) -> dict[str, Tensor]:
+        """State of robots `ids` and of their gait, before `refer`: what `restore` needs to go on walking."""
+        qpos, qvel = self.robots.state(ids)
+        return (
+            {"qpos": qpos, "qvel": qvel}
+            | {name: getattr(self.walker, name)[ids].clone() for name in Walker.STATE}
+            | {"action": self.action[ids].clone()}
+        )
+
+    def restore(self, ids: Tensor, state: dict[str, Tensor]) -> None:
+        """Put robots `ids` into a `snapshot`."""
+        self.robots.set_state(ids, state["qpos"], state["qvel"])
+        for name in Walker.STATE:
+            getattr(self.walker, name)[ids] = state[name]
+        self.action[ids] = state["action"]
+
+    def part(self, ids: Tensor, robots: Robots) -> Controller:
+        """That of robots `ids` (k,) alone, which are `robots` now."""
+        part = Controller(self.spec, robots)
+        for name in Walker.STATE:
+            setattr(part.walker, name, getattr(self.walker, name)[ids])
+        part.action = self.action[ids]
+        return part
+
+    def state_dict(self) -> dict[str, Any]:
+        """State besides the robots'."""
+        return {name: getattr(self.walker, name).clone() for name in Walker.STATE} | {
+            "action": self.action.clone(), "reference": dict(vars(self.reference)),
+        }  # fmt: skip
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        for name in Walker.STATE:
+            setattr(self.walker, name, state[name].clone())
+        self.action, self.reference = state["action"].clone(), Reference(**state["reference"])
