@@ -43,6 +43,7 @@ docs: setup
 nightly: setup
 	$(BIN)/romnav --results .cache/nightly run ablation spawn-goal --scale $(SCALE) --no-resume
 	$(BIN)/romnav --results .cache/nightly check --scale $(SCALE)
+	$(BIN)/pytest -m slow
 	$(BIN)/python benchmarks/faults.py --out .cache/nightly/bench
 
 numbers: setup

@@ -51,7 +51,7 @@ def measure(sensor: Sensor, poses: Poses, spec: PretrainSpec, repeats: int) -> d
 
     works = {
         "poses": lambda: poses(index),
-        "images and labels": lambda: sensor.scan(*pose, labels=True),
+        "images and labels": lambda: pose.scan(sensor, labels=True),
         "corruption": lambda: corrupt(clean, index, index),
         "learning": learn,
     }
@@ -66,7 +66,7 @@ def main() -> None:
     with torch_threads(1):
         for name, (kind, sensor_spec, spec) in SENSORS.items():
             sensor = kind([tile.solids for tile, _ in world], sensor_spec)
-            poses = Poses([grids for _, grids in world], sensor_spec.height, 0)
+            poses = Poses([grids for _, grids in world], sensor_spec.height, 0, sway=spec.sway)
             parts = {k: statistics.median(v) for k, v in measure(sensor, poses, spec, options.repeats).items()}
             making = sum(parts.values()) - parts["learning"]
             record[name] = {

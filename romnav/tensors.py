@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from romnav import files
 from romnav.errors import RomnavError
@@ -56,6 +57,21 @@ class Kind:
         if not isinstance(content, dict) or content.get("format") != self.format:
             raise RomnavError(f"{path}: key 'format' is not {self.format!r}; delete it and {self.again}")
         return content
+
+
+def not_finite(weights: Mapping[str, Tensor]) -> list[str]:
+    """Names of the weights that hold NaN or infinity."""
+    return [name for name, value in weights.items() if not bool(value.isfinite().all())]
+
+
+def require_finite(path: Path, weights: Mapping[str, Tensor], again: str) -> None:
+    """Checks weights that were read from a file.
+
+    Raises:
+        RomnavError: Some are not finite.
+    """
+    if wrong := not_finite(weights):
+        raise RomnavError(f"{path}: {', '.join(wrong[:3])} not finite, of a run that went wrong; {again}")
 
 
 def _check_sums(path: Path) -> None:

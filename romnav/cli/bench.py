@@ -22,7 +22,7 @@ def bench(
     from romnav.experiment.spec import suggest
 
     files = {file.stem: file for file in sorted((here.project.root / "benchmarks").glob("[!_]*.py"))}
-    if not files:
+    if not (files or name):
         raise RomnavError(
             f"{here.project.root / 'benchmarks'}: no benchmarks; change to a copy of the romnav repository"
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -127,7 +128,7 @@ def evaluate(
         for policy in (above for above in stage.upstream if (above.kind, above.arm) == ("policy", driver)):
             require(policy, stage)
     job.make(stages)
-    collected = _collect(job)
+    collected = _collect(job, {str(stage.arm) for stage in stages})
     chosen = names or [run["arm"] for run in collected["arms"]]
     pairs = [(names[0], other) for other in names[1:]] if names else job.project.comparisons(chosen)
     _print_results(collected, chosen, _pairs(chosen, pairs, all_pairs) if paired else [], verbose)
@@ -220,10 +221,10 @@ def _test_navigation(job: DeviceJob) -> None:
     print_table("Locomotion under navigation, shares of episodes", rows, NAVIGATION_COLUMNS)
 
 
-def _collect(at: AtScale) -> dict[str, Any]:
+def _collect(at: AtScale, names: Collection[str] | None = None) -> dict[str, Any]:
     from romnav.report.paired.results import collect
 
-    return collect(at.project.results, at.work.scale)
+    return collect(at.project.results, at.work.scale, names)
 
 
 def _pairs(arms: list[str], compared: list[tuple[str, str]], all_pairs: bool) -> list[tuple[str, str]]:

@@ -64,8 +64,8 @@ class Scale(Config):
         env, cell = self.navigation.env, self.world.grid.cell
         if (way := env.command.forward * env.period) > 2 * cell:
             raise ValueError(
-                f"navigation.env.period: {way:.2f} m in a step at the fastest command, beyond two cells of {cell} m "
-                "(world.grid.cell): robots would jump over walls; lower it"
+                f"navigation.env.period: {way:.2f} m in a step at the fastest (navigation.env.command.forward), "
+                f"beyond two cells of {cell} m (world.grid.cell): robots would jump over walls; lower it"
             )
         for name in ("evaluation", "safety", "deploy"):
             duration = getattr(self, name).duration

@@ -15,7 +15,7 @@ from romnav.navigation.policy import BEARING, NavigationActor
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.encoder import Encoder
-from romnav.tensors import Kind
+from romnav.tensors import Kind, require_finite
 
 KIND = Kind("romnav-policy-1", "policy", "train the arm by `romnav train policy`")
 """Policies, and the states of unfinished runs."""
@@ -31,7 +31,8 @@ def load_actor(
     ``depth_encoder``.
 
     Raises:
-        RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec.
+        RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec or are not
+            finite.
     """
     content = read(path, device)
     own = any(name.startswith("encoder.") for name in content["actor"])
@@ -61,4 +62,5 @@ def load_actor(
     except RuntimeError as error:
         reason = str(error).splitlines()[1].strip()
         raise RomnavError(f"{path}: a policy of another architecture ({reason}); train the arm again") from error
+    require_finite(path, content["actor"], "train the arm again")
     return actor.to(device).eval()

@@ -24,6 +24,7 @@ from romnav.navigation.ppo import BoundedPPO, make_ppo
 from romnav.navigation.spec import KickstartSpec, NavigationSpec
 from romnav.robot.dynamics import Body
 from romnav.robot.rom import ReducedOrderModel
+from romnav.tensors import not_finite
 from romnav.threads import torch_threads
 from romnav.world.world import World
 
@@ -241,8 +242,7 @@ def _check_finite(path: Path, iteration: int, row: dict[str, float], ppo: Bounde
     """Stop before what is not finite is saved; observations that are not end in the normalisers' weights."""
     wrong = [name for name, value in row.items() if name.startswith(("loss_", "reward_")) and not math.isfinite(value)]
     for owner, model in (("actor", ppo.actor), ("critic", ppo.critic)):
-        weights = model.state_dict().items()
-        wrong += [f"{owner} {name}" for name, value in weights if not bool(value.isfinite().all())]
+        wrong += [f"{owner} {name}" for name in not_finite(model.state_dict())]
     if wrong:
         raise RomnavError(
             f"{path}: iteration {iteration}: {', '.join(wrong[:3])} not finite; a checkpoint there is of one before. "

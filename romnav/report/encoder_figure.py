@@ -17,7 +17,7 @@ from romnav.report.pictures import COLOURS
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.pretrain import Poses, Sensor
-from romnav.sensing.spec import CorruptionSpec
+from romnav.sensing.spec import UPRIGHT, CorruptionSpec, SwaySpec
 from romnav.world.grids import Grids
 from romnav.world.solids import Label
 from romnav.world.tile import Tile
@@ -37,6 +37,7 @@ def draw_encoder(
     corruption: CorruptionSpec,
     path: Path,
     *,
+    sway: SwaySpec = UPRIGHT,
     device: str = "cpu",
 ) -> None:
     """Draw one image of every tile class with a fifth and with half of its pixels lost; save to ``path``.
@@ -44,9 +45,9 @@ def draw_encoder(
     Arguments are those of `romnav.sensing.pretrain.quality`.
     """
     index = torch.arange(CANDIDATES, device=device)
-    tile, origin, yaw = Poses([grids for _, grids in tiles], height, 1, device)(index)
-    clean, labels = sensor.scan(tile, origin, yaw, labels=True)
-    kinds = np.array([t.kind for t, _ in tiles])[tile.cpu().numpy()]
+    pose = Poses([grids for _, grids in tiles], height, 1, device, sway)(index)
+    clean, labels = pose.scan(sensor, labels=True)
+    kinds = np.array([t.kind for t, _ in tiles])[pose.tile.cpu().numpy()]
     rows = [
         (share, _richest(labels, torch.tensor(kinds == kind, device=device)), kind)
         for kind in sorted(set(kinds))

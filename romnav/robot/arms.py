@@ -13,8 +13,10 @@ from romnav.robot.g1 import HEAD, build_spec
 from romnav.robot.spec import RobotSpec
 from romnav.robot.statics import NOTHING
 
-LIMIT, STEP = math.radians(12.0), math.radians(3.0)
-"""Largest roll and pitch of the torso in the table, and their spacing, rad: a walking torso stays within."""
+STEP = math.radians(3.0)
+"""Spacing of the table, rad."""
+ROLL, PITCH = (-5, 5), (-4, 12)
+"""First and last roll and pitch of the torso in the table, steps: a walking torso leans forward by 0.1 to 0.55 rad."""
 _ARM = ("shoulder", "elbow", "wrist")
 _ARM_GROUP = 5
 
@@ -33,8 +35,10 @@ class OwnArms:
     """
 
     def __init__(self, robot: RobotSpec, directions: Tensor, *, levelled: bool, device: str = "cpu") -> None:
-        count = 2 * round(LIMIT / STEP) + 1 if levelled else 1
-        angles = (np.arange(count) - count // 2) * STEP
+        self._low, self._high = torch.tensor([ROLL, PITCH] if levelled else [(0, 0), (0, 0)], device=device).T
+        rolls, pitches = (
+            np.arange(a, b + 1) * STEP for a, b in zip(self._low.tolist(), self._high.tolist(), strict=True)
+        )
         model = build_spec(robot, NOTHING, visual=True).compile()
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -46,13 +50,12 @@ class OwnArms:
         model.geom_group[:] = np.where(own, _ARM_GROUP, 0)
         head = data.body("torso_link").xpos + HEAD
         rays = directions.double().cpu().numpy()
-        hidden = [[_hits(model, data, head, rays @ _turn(roll, pitch)) for pitch in angles] for roll in angles]
+        hidden = [[_hits(model, data, head, rays @ _turn(roll, pitch)) for pitch in pitches] for roll in rolls]
         self._hidden = torch.from_numpy(np.array(hidden)).to(device)
 
     def __call__(self, tilt: Tensor) -> Tensor:
         """(E, rows, columns) whether an arm is in the way, for the nearest roll and pitch (E, 2), rad, of the table."""
-        middle = len(self._hidden) // 2
-        index = (tilt / STEP).round().clamp(-middle, middle).long() + middle
+        index = (tilt / STEP).round().long().clamp(self._low, self._high) - self._low
         return self._hidden[index[:, 0], index[:, 1]]
 
 

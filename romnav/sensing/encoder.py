@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from romnav.errors import RomnavError
 from romnav.precision import product_dtype, reduced_precision
 from romnav.sensing.spec import EncoderSpec
-from romnav.tensors import Kind
+from romnav.tensors import Kind, require_finite
 from romnav.world.solids import Label
 
 LOGIT = 10.0
@@ -200,6 +200,7 @@ def load_autoencoder(path: Path, device: str = "cpu") -> Autoencoder:
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise RomnavError(f"{path}: weights of another architecture ({reason}); {AGAIN}") from error
+    require_finite(path, content["weights"], AGAIN)
     return model.to(device).eval()
 
 

@@ -10,7 +10,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -25,7 +25,8 @@ from romnav.progress import Progress
 from romnav.sensing import encoder as checkpoints
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
-from romnav.sensing.spec import CorruptionSpec, PretrainSpec
+from romnav.sensing.spec import UPRIGHT, CorruptionSpec, PretrainSpec, SwaySpec
+from romnav.tensors import not_finite
 from romnav.threads import torch_threads
 from romnav.world.grids import Grids
 from romnav.world.solids import Label
@@ -51,7 +52,20 @@ class Sensor(Protocol):
 
     @property
     def scan(self) -> Callable[..., Any]:
-        """(tile, origin, yaw, labels=...) -> ranges, or ranges and labels."""
+        """(tile, origin, yaw, labels=..., tilt=...) -> ranges, or ranges and labels."""
+
+
+class Pose(NamedTuple):
+    """Where a sensor is in B images: tile (B,), origin (B, 3), yaw (B,), and roll and pitch (B, 2) of the torso."""
+
+    tile: Tensor
+    origin: Tensor
+    yaw: Tensor
+    tilt: Tensor
+
+    def scan(self, sensor: Sensor, *, labels: bool = False) -> Any:
+        """What the sensor sees there: ranges (B, rows, columns), with ``labels`` those, too."""
+        return sensor.scan(self.tile, self.origin, self.yaw, labels=labels, tilt=self.tilt)
 
 
 class Poses:
@@ -59,29 +73,36 @@ class Poses:
 
     Args:
         grids: Grids of each tile.
-        height: Sensor above the walking surface, m.
+        height: Sensor above the walking surface, m, of a robot that stands.
         seed: Seed of the poses.
         device: Torch device.
+        sway: How the head is held.
     """
 
-    def __init__(self, grids: Sequence[Grids], height: float, seed: int, device: str = "cpu") -> None:
-        self._seed, self._height, self._cell = seed, height, grids[0].cell
+    def __init__(
+        self, grids: Sequence[Grids], height: float, seed: int, device: str = "cpu", sway: SwaySpec = UPRIGHT
+    ) -> None:
+        self._seed, self._height, self._sway, self._cell = seed, height, sway, grids[0].cell
         self._node = torch.tensor(np.concatenate([g.position for g in grids]), device=device)
         tile = np.repeat(np.arange(len(grids)), [len(g.position) for g in grids])
         self._tile = torch.tensor(tile, dtype=torch.int32, device=device)
         near = np.concatenate([_near_connector(g) for g in grids])
         self._near = torch.tensor(np.flatnonzero(near if near.any() else ~near), device=device)
 
-    def __call__(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tile (B,), origin (B, 3) and yaw (B,) of the images ``index`` (B,); odd ones are oversampled."""
+    def __call__(self, index: Tensor) -> Pose:
+        """Poses of the images ``index`` (B,); odd ones are oversampled."""
         draw = [random.uniform(self._seed, index, k) for k in range(4)]
         anywhere = random.integers(len(self._node), self._seed, index, 4)
         near = self._near[random.integers(len(self._near), self._seed, index, 5)]
         node = torch.where(index % 2 == 1, near, anywhere)
         jitter = torch.stack([self._cell * (draw[0] - 0.5), self._cell * (draw[1] - 0.5), 0.1 * (draw[2] - 0.5)], 1)
         origin = self._node[node] + jitter
-        origin[:, 2] += self._height
-        return self._tile[node], origin, 2 * math.pi * draw[3]
+        ranges = (self._sway.roll, self._sway.pitch, self._sway.sink)
+        roll, pitch, sink = (
+            low + (high - low) * random.uniform(self._seed, index, 6 + k) for k, (low, high) in enumerate(ranges)
+        )
+        origin[:, 2] += self._height - sink
+        return Pose(self._tile[node], origin, 2 * math.pi * draw[3], torch.stack([roll, pitch], dim=1))
 
 
 def _near_connector(grids: Grids) -> np.ndarray:
@@ -165,7 +186,7 @@ def pretrain(
         RomnavError: What an earlier run left is damaged; a term of the loss is not finite; ``out`` cannot be written.
     """
     path, state_path = out / "encoder.pt", out / "state.pt"
-    poses = Poses([grids for _, grids in tiles], height, spec.seed, device)
+    poses = Poses([grids for _, grids in tiles], height, spec.seed, device, spec.sway)
     key = _key(spec, sensor, poses)
     if resume and path.exists() and checkpoints.read(path).get("key") == key:
         return path
@@ -235,8 +256,7 @@ class _Training:
         spec = self._spec
         epoch, position = divmod(self.step, self._per_epoch)
         index = torch.arange(position * spec.batch, (position + 1) * spec.batch, device=self._device)
-        tile, origin, yaw = self._poses(index)
-        clean, labels = self._sensor.scan(tile, origin, yaw, labels=True)
+        clean, labels = self._poses(index).scan(self._sensor, labels=True)
         seen = self._corrupt(clean, index, torch.full_like(index, epoch))
         generator = torch.Generator(self._device).manual_seed(int(random.bits(spec.seed, self.step)))
         terms = loss_terms(self.model, spec, seen, clean, labels, generator)
@@ -244,8 +264,7 @@ class _Training:
 
     def check(self) -> None:
         """Stop before weights that are not finite are saved."""
-        wrong = [name for name, value in self.model.state_dict().items() if not bool(value.isfinite().all())]
-        if wrong:
+        if wrong := not_finite(self.model.state_dict()):
             raise RomnavError(
                 f"pretraining: step {self.step}: {', '.join(wrong[:3])} not finite; what is saved is of a step before. "
                 "Lower learning_rate"
@@ -283,8 +302,7 @@ def _key(spec: PretrainSpec, sensor: Sensor, poses: Poses) -> str:
     """Fingerprint of everything that decides the weights."""
     digest = hashlib.sha256(spec.model_dump_json().encode())
     probe = torch.arange(256, device=sensor.directions.device)
-    tile, origin, yaw = poses(probe)
-    for tensor in (sensor.directions, sensor.scan(tile, origin, yaw)):
+    for tensor in (sensor.directions, poses(probe).scan(sensor)):
         digest.update(tensor.cpu().numpy().tobytes())
     return digest.hexdigest()[:16]
 
@@ -297,6 +315,7 @@ def quality(
     height: float,
     corruption: CorruptionSpec,
     *,
+    sway: SwaySpec = UPRIGHT,
     images: int = 4096,
     seed: int = 0,
     device: str = "cpu",
@@ -311,20 +330,20 @@ def quality(
         ``valid_iou``, ``dead_dims``, ``latent_dims``, ``divergence_nat``; the errors by tile class in ``tiles``,
         and all of it in ``dropout_50``.
     """
-    poses = Poses([grids for _, grids in tiles], height, seed, device)
+    poses = Poses([grids for _, grids in tiles], height, seed, device, sway)
     kinds = np.array([tile.kind for tile, _ in tiles])
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
         corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)
         sums, means, nats = {str(kind): _Errors(model.encoder.spec.cartesian) for kind in sorted(set(kinds))}, [], []
         for index in torch.arange(images, device=device).split(256):
-            tile, origin, yaw = poses(index)
-            clean, labels = sensor.scan(tile, origin, yaw, labels=True)
+            pose = poses(index)
+            clean, labels = pose.scan(sensor, labels=True)
             mean, log_variance = model.encoder.posterior(corrupt(clean, index, torch.zeros_like(index)))
             out = model.decoder(mean)
             means.append(mean.flatten(1))
             nats.append(divergence(mean, log_variance).sum())
-            of_tile = kinds[tile.cpu().numpy()]
+            of_tile = kinds[pose.tile.cpu().numpy()]
             for kind, errors in sums.items():
                 which = torch.tensor(of_tile == kind, device=device)
                 errors.add(model, clean[which], labels[which], checkpoints.Reconstruction(*(x[which] for x in out)))

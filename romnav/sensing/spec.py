@@ -132,6 +132,22 @@ class EncoderSpec(Config):
         return self
 
 
+class SwaySpec(Config):
+    """How the head of a walking robot is held, against one that stands upright; uniform within the ranges."""
+
+    roll: Range[Pitch] = (0.0, 0.0)
+    """Of the torso, rad."""
+    pitch: Range[Pitch] = (0.0, 0.0)
+    """Of the torso, rad, positive forwards."""
+    sink: Range[NonNegative] = (0.0, 0.0)
+    """Sensor below its height on a standing robot, m."""
+
+
+UPRIGHT = SwaySpec()
+WALKING = SwaySpec(roll=(-0.2, 0.2), pitch=(0.1, 0.55), sink=(0.05, 0.25))
+"""As measured over the gait library of the `cpu` scale, 1st to 99th percentile: knees are bent and the torso leans."""
+
+
 class PretrainSpec(Config):
     """Training of one encoder (paper, "Pretraining Vision Encoders")."""
 
@@ -139,6 +155,8 @@ class PretrainSpec(Config):
     """Network."""
     corruption: CorruptionSpec = CorruptionSpec()
     """What is done to the inputs; targets stay clean."""
+    sway: SwaySpec = Field(default=UPRIGHT, exclude_if=lambda sway: sway == UPRIGHT)
+    """Poses of the head (A: the range image is levelled, so that a tilt moves the edge of what is filled only)."""
     images: Count = 2_000_000
     """Images, half from uniform poses and half on or near stairs and ramps (P)."""
     epochs: Count = 10
@@ -199,6 +217,8 @@ class DepthPretrainSpec(PretrainSpec):
     """Network."""
     corruption: DepthCorruptionSpec = DepthCorruptionSpec()
     """What is done to the inputs; targets stay clean."""
+    sway: SwaySpec = Field(default=WALKING, exclude_if=lambda sway: sway == UPRIGHT)
+    """Poses of the head (A: the camera turns with the torso)."""
     sigma: Positive = 0.2
     """Deviation of the likelihood behind the squared errors, m (A: the ground is near)."""
 

@@ -63,6 +63,8 @@ def test_every_command_explains_itself(words: list[str]) -> None:
     ],
 )
 def test_a_typo_names_the_nearest(project: Path, words: list[str], message: str) -> None:
+    (project / "benchmarks").mkdir()
+    (project / "benchmarks" / "lidar.py").touch()
     assert fails(*words).startswith(message)
     assert not (project / "results").exists()
 

@@ -71,6 +71,21 @@ def test_rows_of_different_episode_sets_are_not_compared(
     assert "rows of different episode sets" in fails("results")
 
 
+def test_rows_of_arms_that_are_not_asked_for_may_be_of_another_set(
+    evaluated: Path, episode_rows: Callable[..., rows.EpisodeRows], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Arms of an ablation are evaluated side by side: the first one to end finds the others' old rows."""
+    stale = evaluated / "results" / "smoke" / "oracle" / "seed-0" / "episodes.parquet"
+    rows.write(stale, episode_rows("oracle", 1.0, episode_set="another"))
+    monkeypatch.setattr("romnav.experiment.graph.run.pending", lambda *_: [])
+    monkeypatch.setattr("romnav.experiment.graph.run.require", lambda *_: None)
+    result = romnav("eval", "rom")
+    assert result.exit_code == 0, result.output
+    assert "rom" in result.stdout
+    refused = romnav("eval", "rom", "oracle")
+    assert (refused.exit_code, "rows of different episode sets" in refused.stderr) == (1, True)
+
+
 @pytest.mark.parametrize(
     ("band", "code", "message"),
     [

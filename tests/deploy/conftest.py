@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from romnav.deploy import export as exporting
 from romnav.deploy.card import INPUTS, Card, Measured
 from romnav.deploy.export import export
 from romnav.navigation.policy import NavigationActor
@@ -78,5 +79,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("deploy") / "policy.onnx"
     measured = Measured(episode_set="paired-2", digest="feed", metrics={"sr_45": 60.3, "t2g": None})
     told = card(depth=DEPTH, proprioception=FELT, measured=measured, inputs=INPUTS)
-    export(*humanoids(), told, path, lambda *_: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exporting, "STEPS", 200)  # all of them in a slow test
+        export(*humanoids(), told, path, lambda *_: None)
     return path

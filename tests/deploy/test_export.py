@@ -23,7 +23,7 @@ def told(file: Path) -> Card:
 
 
 def test_a_humanoids_policy_is_that_of_pytorch(exported: Path) -> None:
-    """With depth, proprioception and an encoder of its own: `export` held it against PyTorch over 1,000 steps."""
+    """With depth, proprioception and an encoder of its own: `export` held it against PyTorch."""
     card = told(exported)
     assert card.error is not None
     assert 0.0 < card.error <= TOLERANCE
@@ -36,6 +36,8 @@ def test_a_humanoids_policy_is_that_of_pytorch(exported: Path) -> None:
 
 @pytest.mark.slow
 def test_a_policy_of_the_reduced_order_model_is_that_of_pytorch(tmp_path: Path) -> None:
+    """Over 1,000 steps."""
+    assert module.STEPS == 1000
     lidar, _ = encoders()
     card_ = card()
     assert export(actor(lidar), lidar, None, card_, tmp_path / "p.onnx", lambda *_: None).error <= TOLERANCE  # type: ignore[operator]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +36,7 @@ from romnav.report.spec import PAIRED
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
 from romnav.world.tiles.generate import generate
+from tests.examples.conftest import ROOT, SCALE
 from tests.navigation.conftest import FakePerception
 
 MAZE = "examples.maze:Maze"
@@ -166,3 +170,24 @@ def test_a_table_shows_the_detours_of_successes(work: Workspace, episode_rows: A
             cell = shown[label][k]
             assert cell.value == pytest.approx(expected)
             assert cell.facts["lo"] < expected < cell.facts["hi"]
+
+
+@pytest.mark.slow
+def test_one_command_makes_their_table(tmp_path: Path) -> None:
+    """Every arm with its part, trained, evaluated and tabulated in processes of their own."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    (tmp_path / "experiments" / "scales").mkdir(parents=True)
+    (tmp_path / "experiments" / "scales" / "smoke.toml").write_text(
+        SCALE + "[lidar]\nrows = 15\ncolumns = 55\n[pretrain]\nimages = 256\nepochs = 1\n"
+        '[evaluation]\nepisodes = "tiny"\nduration = 45.0\n'
+    )
+    shutil.copy(ROOT / "examples" / "parts.toml", tmp_path / "experiments")
+    for words in (["episodes", "tiny", "--tiles", "2", "--count", "32"], ["run", "ablation", "parts"]):
+        command = [sys.executable, "-m", "romnav.cli", *words]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-2000:]
+    table = (tmp_path / "results" / "smoke" / "tables" / "parts.md").read_text()
+    labels = Project(tmp_path, tmp_path / "results").experiment("parts").labels.values()
+    for word in ("Detour, cross", *labels):
+        assert word in table

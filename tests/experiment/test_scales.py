@@ -5,26 +5,16 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import BaseModel
 
 from romnav.errors import RomnavError
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import parse
-
-FILE = Path("mine.toml")
-
-
-def nested(key: str, value: Any) -> dict[str, Any]:
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    return value
+from tests.fuzz import FILE, leaves, nested
 
 
 @pytest.mark.parametrize(
@@ -86,16 +76,6 @@ def test_a_bad_setting_is_refused_by_its_key(key: str, value: Any) -> None:
     assert message.startswith("mine.toml: ")
     assert key in message.replace(": ", ".", 2) or key in message
     assert "\n" not in message
-
-
-def leaves(config: BaseModel, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting with its default."""
-    for name in type(config).model_fields:
-        value = getattr(config, name)
-        if isinstance(value, BaseModel):
-            yield from leaves(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
 
 
 SETTINGS = dict(leaves(Scale()))

@@ -291,6 +291,11 @@ def test_policy_errors_name_file_and_fix(
     checkpoint.save(tmp_path / "renamed.pt", {**checkpoint.read(path), "encoder": other.digest()})
     with pytest.raises(RomnavError, match=r"renamed\.pt: a policy of another architecture .*attention\.embed"):
         checkpoint.load_actor(tmp_path / "renamed.pt", other)
+    broken = checkpoint.read(path)
+    broken["actor"]["state_embedding.0.weight"][0] = torch.inf
+    checkpoint.save(tmp_path / "broken.pt", broken)
+    with pytest.raises(RomnavError, match=r"broken\.pt: state_embedding\.0\.weight not finite"):
+        checkpoint.load_actor(tmp_path / "broken.pt", encoder)
     with pytest.raises(RomnavError, match=r"none\.pt: no such policy; train the arm"):
         checkpoint.read(tmp_path / "none.pt")
     content = path.read_bytes()

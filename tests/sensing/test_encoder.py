@@ -117,6 +117,14 @@ def test_a_truncated_checkpoint_is_named(checkpoint: Path, keep: float) -> None:
         checkpoints.load(checkpoint)
 
 
+def test_weights_that_are_not_finite_are_refused(checkpoint: Path) -> None:
+    content = checkpoints.read(checkpoint)
+    content["weights"]["encoder.mean.bias"][0] = torch.nan
+    torch.save(content, checkpoint)
+    with pytest.raises(RomnavError, match=r"encoder\.pt: encoder\.mean\.bias not finite"):
+        checkpoints.load(checkpoint)
+
+
 def test_another_file_is_refused(checkpoint: Path) -> None:
     torch.save({"weights": {}}, checkpoint)
     with pytest.raises(RomnavError, match="key 'format'"):

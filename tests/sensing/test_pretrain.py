@@ -16,7 +16,16 @@ from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.lidar import Lidar
 from romnav.sensing.pretrain import TERMS, Poses, divergence, loss_terms, pretrain, quality
-from romnav.sensing.spec import CorruptionSpec, DepthPretrainSpec, DepthSpec, EncoderSpec, LidarSpec, PretrainSpec
+from romnav.sensing.spec import (
+    UPRIGHT,
+    WALKING,
+    CorruptionSpec,
+    DepthPretrainSpec,
+    DepthSpec,
+    EncoderSpec,
+    LidarSpec,
+    PretrainSpec,
+)
 from romnav.stopping import Stopped
 from romnav.world.grids import Grids, rasterise
 from romnav.world.solids import Label, SolidsBuilder
@@ -103,8 +112,9 @@ def test_poses_are_half_near_connectors_and_stand_on_the_surface(tiles: list[tup
     grids = tiles[0][1]
     poses = Poses([grids], HEIGHT, seed=0)
     index = torch.arange(4000)
-    tile, origin, yaw = poses(index)
+    tile, origin, yaw, tilt = poses(index)
     assert (tile == 0).all()
+    assert (tilt == 0).all()
     nodes = torch.tensor(grids.position)
     gap = torch.cdist(origin - torch.tensor([0.0, 0.0, HEIGHT]), nodes).min(1).values
     assert gap.max() < 0.16
@@ -117,10 +127,29 @@ def test_poses_are_half_near_connectors_and_stand_on_the_surface(tiles: list[tup
     assert torch.equal(again[1], origin[100:200])
 
 
+def test_a_walking_head_is_lower_and_leans(tiles: list[tuple[Tile, Grids]]) -> None:
+    index = torch.arange(4000)
+    upright, walking = (Poses([tiles[0][1]], HEIGHT, 0, sway=sway)(index) for sway in (UPRIGHT, WALKING))
+    for mine, theirs in ((upright.tile, walking.tile), (upright.yaw, walking.yaw)):
+        assert torch.equal(mine, theirs)
+    sink = upright.origin - walking.origin
+    assert (sink[:, :2] == 0).all()
+    for drawn, (low, high) in zip(
+        (*walking.tilt.T, sink[:, 2]), (WALKING.roll, WALKING.pitch, WALKING.sink), strict=True
+    ):
+        assert low - 1e-5 <= drawn.min() < low + 0.05 * (high - low)
+        assert high + 1e-5 >= drawn.max() > high - 0.05 * (high - low)
+
+
+def test_a_sensor_that_is_held_upright_has_the_key_of_one_without_sway() -> None:
+    assert "sway" not in PretrainSpec().model_dump()
+    assert "sway" in DepthPretrainSpec().model_dump()
+
+
 def test_overfits_a_few_images(tiles: list[tuple[Tile, Grids]], lidar: Lidar) -> None:
     spec = SPEC.model_copy(update={"kl_weight": 0.02, "sigma": 0.5})
     index = torch.arange(64)
-    clean, labels = lidar.scan(*Poses([tiles[0][1]], HEIGHT, 0)(index), labels=True)
+    clean, labels = Poses([tiles[0][1]], HEIGHT, 0)(index).scan(lidar, labels=True)
     torch.manual_seed(0)
     model = Autoencoder(spec.encoder, lidar.directions)
     optimizer = torch.optim.AdamW(model.parameters(), 6e-3)
@@ -236,7 +265,7 @@ def test_quality_of_a_known_model(tiles: list[tuple[Tile, Grids]], lidar: Lidar)
         model.encoder.mean.weight.normal_(0, 3.0, generator=torch.Generator().manual_seed(0))
         model.encoder.mean.weight[5] = 0
     found = quality(model, tiles, lidar, HEIGHT, CorruptionSpec(), images=64)
-    clean, labels = lidar.scan(*Poses([tiles[0][1]], HEIGHT, 0)(torch.arange(64)), labels=True)
+    clean, labels = Poses([tiles[0][1]], HEIGHT, 0)(torch.arange(64)).scan(lidar, labels=True)
     valid = clean > 0
     assert found["depth_mae_m"] == pytest.approx(float((clean[valid] - 3).abs().mean()), abs=1e-3)
     assert found["xyz_error_m"] == pytest.approx(float(clean[valid].mean()), abs=1e-3)

@@ -99,11 +99,11 @@ def _judge(work: Workspace, sensor: str, stage: Stage, session: Session, progres
         progress(index + 1, spec.tiles, "tiles")
     scanner = make_sensor(work, settings, sensor, [tile for tile, _ in tiles], session.device)
     model = load_autoencoder(stage.upstream[0].folder / "encoder.pt", session.device)
-    corruption = getattr(settings, SENSORS[sensor]).corruption
-    judged = (model, tiles, scanner, scanner.spec.height, corruption)
-    measured = quality(*judged, images=spec.images, device=session.device)
+    training = getattr(settings, SENSORS[sensor])
+    judged = (model, tiles, scanner, scanner.spec.height, training.corruption)
+    measured = quality(*judged, sway=training.sway, images=spec.images, device=session.device)
     files.write(stage.folder / "quality.json", json.dumps(measured, indent=2) + "\n")
-    draw_encoder(*judged, stage.folder / "encoder.png", device=session.device)
+    draw_encoder(*judged, stage.folder / "encoder.png", sway=training.sway, device=session.device)
     return {}
 
 

@@ -63,7 +63,8 @@ def _write(
     from romnav.report import formats
     from romnav.report.paired import results, tables
 
-    arms, published = results.load(work.project.results, work.scale), work.project.published(name)
+    shown = {str(above.arm) for above in stage.upstream}
+    arms, published = results.load(work.project.results, work.scale, shown), work.project.published(name)
     bootstrap = Bootstrap(arms, outside=_outside([declared]))
     built = []
     for table, spec in declared.tables.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,19 @@ from romnav.evaluation.paired.statistics import Bootstrap
 ROWS_FILE = "episodes.parquet"
 
 
-def load(results_dir: Path, scale: str) -> list[rows.Arm]:
-    """Reads the rows of every arm of a scale, from ``<results_dir>/<scale>/<arm>/seed-<n>/episodes.parquet``.
+def load(results_dir: Path, scale: str, arms: Collection[str] | None = None) -> list[rows.Arm]:
+    """Reads the rows of ``arms``, or of all of a scale: ``<results_dir>/<scale>/<arm>/seed-<n>/episodes.parquet``.
 
     Raises:
         RomnavError: There are none, one is unreadable, or they cannot be compared.
     """
     folder = results_dir / scale
     found = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
-    files = [file for file in found if file.parts[-2].removeprefix("seed-").isdecimal()]
+    files = [
+        file
+        for file in found
+        if file.parts[-2].removeprefix("seed-").isdecimal() and (arms is None or file.parts[-3] in arms)
+    ]
     if not files:
         raise NothingRecorded(
             f"{folder}: no arm has been evaluated; run `romnav run ablation spawn-goal --scale {scale}`"
@@ -38,15 +43,17 @@ def _read_in_place(file: Path, scale: str) -> rows.EpisodeRows:
     return run
 
 
-def collect(results_dir: Path, scale: str) -> dict[str, Any]:
+def collect(results_dir: Path, scale: str, names: Collection[str] | None = None) -> dict[str, Any]:
     """What ``romnav results --json`` prints: metrics per arm and training seed, contrasts per ordered pair.
+
+    Of the arms ``names`` alone, if they are given: rows of others, be they stale, do not matter then.
 
     Rates and differences are in percent, times in s, training in environment steps and hours; a value that
     does not exist (time to goal without a success) is None. Contrasts pool the training seeds of an arm; their interval
     is over episodes, and over tiles (tile_lo, tile_hi), whose episodes are alike; a_only and b_only count the episodes
     that one of two runs solves, mid_p is McNemar's.
     """
-    arms = load(results_dir, scale)
+    arms = load(results_dir, scale, names)
     bootstrap, by_tile = Bootstrap(arms), Bootstrap(arms, cluster="tile")
     return {
         "scale": scale,

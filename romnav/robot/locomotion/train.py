@@ -26,7 +26,7 @@ from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.spec import LocomotionSpec, PpoSpec
-from romnav.tensors import Kind
+from romnav.tensors import Kind, not_finite, require_finite
 from romnav.world.build import build
 
 KIND = Kind("romnav-locomotion-1", "locomotion policy", "train one with `romnav train locomotion`")
@@ -144,7 +144,9 @@ def load_policy(path: Path) -> tuple[LocomotionSpec, Callable[[Tensor], Tensor],
     width = saved["ppo"]["actor_state_dict"]["obs_normalizer._mean"].shape[1]
     actions = saved["ppo"]["actor_state_dict"]["distribution.std_param"].shape[0]
     actor = make_actor(spec.ppo, TensorDict({"policy": torch.zeros(1, width)}, batch_size=[1]), actions)
-    actor.load_state_dict({**saved["ppo"]["actor_state_dict"], **saved["average"]})
+    weights = {**saved["ppo"]["actor_state_dict"], **saved["average"]}
+    require_finite(path, weights, KIND.again)
+    actor.load_state_dict(weights)
     actor.eval()
 
     def policy(obs: Tensor) -> Tensor:
@@ -296,8 +298,7 @@ def _leads_to(saved: dict[str, Any], spec: LocomotionSpec) -> bool:
 def _check_finite(path: Path, iteration: int, row: dict[str, float], ppo: PPO) -> None:
     wrong = [name for name, value in row.items() if not np.isfinite(value)]
     for owner, model in (("actor", ppo.actor), ("critic", ppo.critic)):
-        state = model.state_dict()
-        wrong += [f"{owner} {name}" for name, value in state.items() if not bool(value.isfinite().all())]
+        wrong += [f"{owner} {name}" for name in not_finite(model.state_dict())]
     if wrong:
         raise RomnavError(
             f"{path}: iteration {iteration}: {', '.join(wrong[:3])} not finite; the checkpoint is of one before. "

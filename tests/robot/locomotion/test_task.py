@@ -125,6 +125,11 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
         train(SPEC.model_copy(update={"seed": 9}), tmp_path / "parts", threads=1)
     with pytest.raises(RomnavError, match="has had 2 iterations, more than"):
         train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
+    broken = KIND.load(parts)
+    broken["average"]["mlp.0.bias"][0] = torch.nan
+    KIND.save(tmp_path / "broken.pt", broken)
+    with pytest.raises(RomnavError, match=r"broken\.pt: mlp\.0\.bias not finite"):
+        load_policy(tmp_path / "broken.pt")
     with pytest.raises(RomnavError, match="no such locomotion policy"):
         load_policy(tmp_path / "none.pt")
 
