@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -65,4 +66,29 @@ def episodes(
         return
     typer.echo(f"{len(chosen)} episodes: {', '.join(map(str, chosen[:20]))}{', ...' if len(chosen) > 20 else ''}")
     seen.draw(chosen[:count], path)
+    typer.echo(path)
+
+
+@command(play, "episode")
+def episode(
+    at: AtScale,
+    arm: ArmArgument,
+    number: Annotated[int, typer.Argument(metavar="EPISODE", min=0, help="Number of the episode.")],
+    out: Annotated[
+        Path | None, typer.Option(help="MP4 or GIF to write; default: results/<scale>/figures/<arm>-<episode>.mp4.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Times as fast as it was.")] = 2.0,
+    size: Annotated[int, typer.Option(min=64, max=2048, help="Height, pixels; the width is twice that.")] = 480,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Training seed.")] = 0,
+) -> None:
+    """Film an episode of an arm, from behind and from above; the humanoid with its meshes."""
+    from romnav.report.replay import opengl
+
+    opengl.choose()
+    from romnav.experiment.kinds.replays import Again
+    from romnav.progress import bar
+
+    path = out or at.work.folder / "figures" / f"{arm}-{number}.mp4"
+    with bar(f"film of {arm}, episode {number}") as progress:
+        Again(at.work, arm, seed).film(number, path, speed, size, progress)
     typer.echo(path)

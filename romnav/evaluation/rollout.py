@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
@@ -62,6 +63,10 @@ class View:
         r = self.robot
         return self._lookup(r.tile, r.layer, r.position[:, :2], self.goal)
 
+    def counters(self) -> Tensor:
+        """(A, 2) environment and step, which name the sensors' noise."""
+        return torch.stack([self.noise, torch.full_like(self.noise, self.step)], dim=1)
+
     def select(self, keep: Tensor) -> None:
         """Keep only the rows ``keep``."""
         self.robot.select(keep)
@@ -80,11 +85,12 @@ class Policy:
 
     def command(self, view: View) -> Tensor:
         """(A, 3) velocity command."""
+        return to_command(self.actor(self.observe(view)), view.env.command)
+
+    def observe(self, view: View) -> TensorDict:
+        """What the policy knows of the ``A`` running episodes."""
         goal = view.goal_position, view.goal_yaw
-        counters = torch.stack([view.noise, torch.full_like(view.noise, view.step)], dim=1)
-        d_max = view.env.max_goal_distance
-        obs = observe(view.robot, *goal, view.previous, counters, self.perception, d_max)
-        return to_command(self.actor(obs), view.env.command)
+        return observe(view.robot, *goal, view.previous, view.counters(), self.perception, view.env.max_goal_distance)
 
     def select(self, keep: Tensor) -> None:
         """Drop the memory of all but the rows ``keep``."""

@@ -41,7 +41,8 @@ class Eye:
         self.corruption = corruption
         self.encoder = encoder
         self.arms = arms
-        self._mount = torch.tensor([0.0, 0.0, sensor.spec.height], device=encoder.directions.device)
+        self.mount = torch.tensor([0.0, 0.0, sensor.spec.height], device=encoder.directions.device)
+        """(3,) of a sensor without a head, above the ground, m."""
 
     def ranges(self, robot: Dynamics, counters: Tensor) -> Tensor:
         """(E, rows, columns) images in m, 0 where there is no return.
@@ -50,7 +51,7 @@ class Eye:
             robot: Carries the sensor in its head.
             counters: (E, 2) environment and step, which name the random numbers of the corruption.
         """
-        origin, yaw, tilt = viewpoint(robot, self._mount)
+        origin, yaw, tilt = viewpoint(robot, self.mount)
         ranges = self.sensor.scan(robot.tile.to(torch.int32), origin, yaw, tilt=tilt)
         if self.arms is not None and tilt is not None:
             ranges = torch.where(self.arms(tilt), 0.0, ranges)

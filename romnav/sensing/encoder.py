@@ -157,6 +157,11 @@ class Autoencoder(nn.Module):
                     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
+    @torch.no_grad()
+    def segment(self, ranges: Tensor) -> Tensor:
+        """(B, rows, columns) int8 `Label` that the decoder reads from the code of ``ranges`` (B, rows, columns), m."""
+        return self.decoder(self.encoder.posterior(ranges)[0]).classes.argmax(dim=1).to(torch.int8)
+
 
 def untrained(spec: EncoderSpec, directions: Tensor, seed: int) -> Autoencoder:
     """Encoder and decoder with the random weights of ``seed``."""

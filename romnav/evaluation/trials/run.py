@@ -19,19 +19,14 @@ from torch import Tensor
 from romnav import random
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.rollout import Driver, Outcomes, View
+from romnav.evaluation.shield import Shield
 from romnav.evaluation.spec import TrialSpec
-from romnav.navigation.observations import rotate
-from romnav.navigation.perception import viewpoint
 from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
-from romnav.robot.arms import OwnArms
 from romnav.robot.body import BodyModel
 from romnav.robot.dynamics import Dynamics
 from romnav.robot.spec import RobotSpec
-from romnav.safety.barrier import Filtered, Status
-from romnav.safety.filter import SafetyFilter
-from romnav.sensing.corruption import Corruption
-from romnav.sensing.lidar import Lidar
+from romnav.safety.barrier import Status
 from romnav.threads import torch_threads
 from romnav.world.geodesic import UNIT
 from romnav.world.lookup import GeodesicLookup
@@ -105,52 +100,6 @@ class TrialRobot(Dynamics, Protocol):
 
 TrialBody = Callable[[World, int, float], TrialRobot]
 """Makes the robots of a world, a number of them and a control period, s."""
-
-
-class Shield:
-    """The safety filter of ``robots`` robots, fed by a LiDAR of its own."""
-
-    def __init__(
-        self, world: World, robots: int, spec: TrialSpec, env: EnvSpec, robot: RobotSpec | None = None
-    ) -> None:
-        """A filter that guards ``robots`` bodies without arms, or humanoids of the kind ``robot``."""
-        device = str(world.node.device)
-        limits = {"forward": env.command.forward, "reverse": env.command.reverse, "lateral": env.command.lateral}
-        barrier = spec.filter.filter.model_copy(update={"period": env.period, **limits})
-        self._lidar = Lidar([tile.solids for tile in world.tiles], spec.sensor, device)
-        self._arms = OwnArms(robot, self._lidar.directions, levelled=True, device=device) if robot else None
-        self._corruption = Corruption(spec.corruption, spec.seed, device)
-        self._filter = SafetyFilter(robots, spec.filter.model_copy(update={"filter": barrier}), device)
-        self._mount = torch.tensor([0.0, 0.0, spec.sensor.height], device=device)
-        self._pose = torch.full((robots, 4), torch.nan, device=device)
-
-    def __call__(self, robot: Dynamics, guarded: Tensor, velocity: Tensor, noise: Tensor, step: int) -> Filtered:
-        """Filter velocities (B, 2) of the robots ``guarded`` (B,), with sensor noise ``noise`` (B,)."""
-        tile, position, yaw = robot.tile[guarded], robot.position[guarded], robot.yaw[guarded]
-        origin, heading, tilt = viewpoint(robot, self._mount)
-        origin, heading, tilt = origin[guarded], heading[guarded], None if tilt is None else tilt[guarded]
-        ranges = self._lidar.scan(tile.to(torch.int32), origin, heading, tilt=tilt)
-        if self._arms is not None and tilt is not None:
-            ranges = torch.where(self._arms(tilt), 0.0, ranges)
-        ranges = self._corruption(ranges, noise, torch.full_like(noise, step))
-        points = ranges[..., None] * self._lidar.directions
-        if tilt is None:
-            points = points + self._mount
-        else:
-            # the image is levelled, but the head is turned and ahead of the feet
-            above = torch.cat([rotate((origin - position)[:, :2], yaw), (origin - position)[:, 2:]], dim=1)
-            turned = rotate(points[..., :2].flatten(1, 2), yaw - heading).view_as(points[..., :2])
-            points = torch.cat([turned, points[..., 2:]], dim=-1) + above[:, None, None]
-        pose = torch.cat([position, yaw[:, None]], dim=1)
-        moved = pose - self._pose
-        motion = torch.cat([rotate(moved[:, :2], self._pose[:, 3]), moved[:, 2:]], dim=1)
-        self._pose = pose
-        return self._filter(points.flatten(1, 2), velocity, (ranges > 0).flatten(1), motion)
-
-    def select(self, keep: Tensor) -> None:
-        """Keep only the robots ``keep`` (K,)."""
-        self._filter.select(keep)
-        self._pose = self._pose[keep]
 
 
 @dataclass

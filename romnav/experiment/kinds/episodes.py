@@ -34,7 +34,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         settings=driven.settings,
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
-        reads=(_set(work),),
+        reads=(paired_set(work),),
         code=driven.code,
         upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
@@ -59,7 +59,8 @@ def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
     return stages, left_out
 
 
-def _set(work: Workspace) -> Path:
+def paired_set(work: Workspace) -> Path:
+    """File of the episodes that tables are made of."""
     return work.project.root / "experiments" / "episodes" / f"{work.settings.evaluation.episodes}.json"
 
 
@@ -69,7 +70,7 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
     from romnav.evaluation.paired.run import run
     from romnav.evaluation.tracks import Recorder, write
 
-    work, settings, path = driven.work, driven.settings, _set(driven.work)
+    work, settings, path = driven.work, driven.settings, paired_set(driven.work)
     paired = load(path)
     world = terrain(paired, path, work.project.worlds).to(session.device)
     robots = body(work, settings, driven.seed, session.device, settings.evaluation.threads)
@@ -104,7 +105,7 @@ def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
     from romnav.evaluation.tracks import read
     from romnav.report.paired.gallery import EpisodeGallery
 
-    stage, path = episodes(work, arm, seed), _set(work)
+    stage, path = episodes(work, arm, seed), paired_set(work)
     run = rows.read(stage.folder / "episodes.parquet")
     tracks, _ = read(stage.folder / "tracks.npz")
     paired, world = ground(path, work.project.worlds)

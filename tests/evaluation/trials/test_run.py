@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from romnav.evaluation.rollout import Oracle, Straight, View
+from romnav.evaluation.shield import Shield
 from romnav.evaluation.spec import TrialSpec
 from romnav.evaluation.trials import run as trials
 from romnav.navigation.spec import EnvSpec
@@ -141,7 +142,7 @@ class Facing(ReducedOrderModel):
 
 
 def guarded_velocity(world: World, robot: Facing) -> torch.Tensor:
-    shield = trials.Shield(world, 1, TrialSpec(), EnvSpec())
+    shield = Shield(world, 1, TrialSpec(), EnvSpec())
     wanted, noise = torch.tensor([[1.0, 0.0]]), torch.tensor([0])
     safe = shield(robot, torch.tensor([1]), wanted, noise, 1)
     assert safe.status[0] == Status.FILTERED
@@ -167,7 +168,7 @@ def test_the_shield_looks_through_a_head_that_is_turned_and_ahead_of_the_feet(wo
             torch.testing.assert_close(a, b, atol=0.1, rtol=0)
         else:
             # with its back to the tube, nothing is in the way
-            shields = [trials.Shield(world, 1, TrialSpec(), EnvSpec()) for _ in range(2)]
+            shields = [Shield(world, 1, TrialSpec(), EnvSpec()) for _ in range(2)]
             wanted, noise = torch.tensor([[0.3, 0.0]]), torch.tensor([0])
             for shield, robot in zip(shields, (standing, swaying), strict=True):
                 assert shield(robot, torch.tensor([1]), wanted, noise, 1).velocity[0, 0] > 0.29

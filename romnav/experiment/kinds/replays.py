@@ -1,0 +1,124 @@
+"""Single episodes of an arm again, for everything that evaluation does not keep."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from romnav.errors import RomnavError
+from romnav.experiment.kinds._driven import Driven
+from romnav.experiment.kinds.encoder import encoder
+from romnav.experiment.kinds.episodes import ground, paired_set
+from romnav.experiment.kinds.locomotion import body
+from romnav.experiment.workspace import Workspace
+from romnav.progress import Progress
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from romnav.evaluation.episodes import EpisodeSet
+    from romnav.evaluation.paired.replay import Replay, Sight
+    from romnav.evaluation.rollout import Driver
+    from romnav.evaluation.tracks import Tracks
+    from romnav.world.world import World
+
+
+class Again:
+    """An arm, trained or scripted, on the episodes that tables are made of."""
+
+    def __init__(self, work: Workspace, arm: str, seed: int) -> None:
+        self._driven = Driven.by(work, arm, seed)
+        self.settings = self._driven.settings
+
+    @cached_property
+    def ground(self) -> tuple[EpisodeSet, World]:
+        """The episodes and their terrain."""
+        work = self._driven.work
+        return ground(paired_set(work), work.project.worlds)
+
+    @cached_property
+    def _tracks(self) -> Tracks | None:
+        """Of the evaluation, if it was on these episodes."""
+        from romnav.evaluation.tracks import read
+
+        file = self._driven.folder / "tracks.npz"
+        if not file.exists():
+            return None
+        tracks, provenance = read(file)
+        return tracks if provenance["episode_set"] == self.ground[0].digest else None
+
+    @cached_property
+    def _driver(self) -> Driver:
+        return self._driven.driver(self.ground[1], "cpu")
+
+    def drive(self, episode: int, *, guarded: bool = False, progress: Progress | None = None) -> Replay:
+        """An episode, led along its recorded way if there is one, a safety filter looking on if it is ``guarded``.
+
+        Raises:
+            RomnavError: The arm is not trained, or there is no such episode.
+        """
+        from romnav.evaluation.paired.replay import replay
+        from romnav.evaluation.rollout import Policy
+        from romnav.evaluation.shield import Shield
+
+        paired, world = self.ground
+        if not 0 <= episode < len(paired):
+            raise RomnavError(f"episode {episode}: there are 0 to {len(paired) - 1} in {paired.name}")
+        driver, settings = self._driver, self.settings
+        if isinstance(driver, Policy):
+            driver.actor.reset()
+        walks = settings.navigation.dynamics == "g1"
+        robot = settings.locomotion.robot if walks else None
+        return replay(
+            driver,
+            world,
+            paired,
+            episode,
+            settings.navigation.env,
+            settings.evaluation,
+            tracks=None if walks else self._tracks,
+            body=body(self._driven.work, settings, self._driven.seed, "cpu", settings.evaluation.threads),
+            shield=Shield(world, 1, settings.safety, settings.navigation.env, robot) if guarded else None,
+            progress=progress,
+        )
+
+    def segment(self, sight: Sight | None) -> NDArray[np.int8] | None:
+        """Classes (K, rows, columns) that the arm's pretrained encoder sees; None where it has none."""
+        import torch
+
+        from romnav.sensing.encoder import load_autoencoder
+
+        if sight is None or not self.settings.navigation.encoder.pretrained:
+            return None
+        pretrained = encoder(self._driven.work, "lidar", self.settings)
+        ranges = torch.from_numpy(sight.ranges)
+        return load_autoencoder(pretrained.folder / "encoder.pt").segment(ranges).numpy()
+
+    def film(self, episode: int, path: Path, speed: float, size: int, progress: Progress) -> None:
+        """Writes an episode as a video, ``speed`` times as fast as it was, ``size`` pixels high.
+
+        Raises:
+            RomnavError: As `drive`; it cannot be drawn or written.
+        """
+        from romnav.report.paired.maps import shortest
+        from romnav.report.replay.video import RATE, Film, write
+
+        again = self.drive(episode)
+        paired, world = self.ground
+        goal = np.array([paired.columns[f"goal_{axis}"][episode] for axis in "xyz"])
+        (route,) = shortest(world, paired, [episode])
+        tile, period = world.tiles[paired.columns["tile"][episode]], self.settings.navigation.env.period
+        film = Film(tile, again, goal, route, self.settings.locomotion.robot, size)
+        count = round(len(again.command) * period / speed * RATE) + RATE
+        write(path, _told(film.frames(speed, period), count, progress))
+
+
+def _told(frames: Iterator[NDArray[np.uint8]], count: int, progress: Progress) -> Iterator[NDArray[np.uint8]]:
+    """The same frames, about ``count``, with progress."""
+    for k, frame in enumerate(frames, 1):
+        progress(min(k, count), count, "")
+        yield frame

@@ -1,0 +1,1 @@
+"""Episodes in 3D: in the browser and as videos."""

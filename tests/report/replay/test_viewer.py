@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from romnav.errors import RomnavError
+from romnav.evaluation.paired.replay import replay
+from romnav.evaluation.rollout import Oracle
+from romnav.evaluation.spec import EvaluationSpec
+from romnav.navigation.spec import EnvSpec
+from romnav.report.paired.gallery import EpisodeGallery
+from romnav.robot.spec import RobotSpec
+
+pytest.importorskip("viser", reason="the extra view is not installed")
+
+from romnav.report.replay.viewer import HEIGHT, Seen, Viewer
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def viewer(galleries: dict[str, EpisodeGallery]) -> Iterator[Viewer]:
+    first = galleries["oracle"]
+
+    def drive(name: str, episode: int) -> Seen:
+        return Seen(replay(Oracle(), first.world, first.episodes, episode, EnvSpec(), EvaluationSpec()), None)
+
+    made = Viewer(galleries, [3, 5], drive, RobotSpec(), port=free_port())
+    made._playing.value = False
+    yield made
+    made.stop()
+
+
+def test_robots_stand_where_their_tracks_are_and_stay_where_they_end(viewer: Viewer) -> None:
+    for step in (0, 7, 10_000):
+        viewer._show(step)
+        for name, gallery in viewer._galleries.items():
+            way = gallery.tracks.position[gallery.tracks.of(3)]
+            expected = way[min(step, len(way) - 1)] + [0, 0, HEIGHT / 2]
+            np.testing.assert_allclose(viewer._bodies[name].position, expected, atol=1e-5)
+
+
+def test_storeys_above_those_to_show_are_hidden(viewer: Viewer) -> None:
+    viewer._follow.value = False
+    for last in (1, 2):
+        viewer._storeys.value = last
+        viewer._show(0)
+        assert all(mesh.visible == (storey < last) for storey, mesh in viewer._walls)
+    viewer._follow.value = True
+
+
+def test_what_an_arm_decided_is_told_when_it_is_looked_through(viewer: Viewer) -> None:
+    viewer._eyes.value = "oracle"
+    viewer._look()
+    assert "m/s ahead" in viewer._decided.content
+    viewer._eyes.value = "none"
+    viewer._look()
+    assert viewer._decided.content == ""
+
+
+def test_another_episode_replaces_the_one_before(viewer: Viewer) -> None:
+    viewer._open(5)
+    row = viewer._table.loc[5]
+    assert f"{row.geodesic:.1f} m" in viewer._told.content
+    assert viewer._time.max >= 1
+    viewer._open(3)
+
+
+def test_it_listens_on_the_loopback_alone_and_a_taken_port_is_one_line(
+    viewer: Viewer, galleries: dict[str, EpisodeGallery]
+) -> None:
+    assert viewer.server.get_host() == "127.0.0.1"
+    with pytest.raises(RomnavError, match="--port"):
+        Viewer(galleries, [3], viewer._drive, RobotSpec(), port=viewer.server.get_port())
