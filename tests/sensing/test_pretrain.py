@@ -146,6 +146,7 @@ def test_a_sensor_that_is_held_upright_has_the_key_of_one_without_sway() -> None
     assert "sway" in DepthPretrainSpec().model_dump()
 
 
+@pytest.mark.slow
 def test_overfits_a_few_images(tiles: list[tuple[Tile, Grids]], lidar: Lidar) -> None:
     spec = SPEC.model_copy(update={"kl_weight": 0.02, "sigma": 0.5})
     index = torch.arange(64)
