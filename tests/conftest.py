@@ -41,6 +41,9 @@ def _episode_rows(
         "final_distance": np.where(solved, 0.3, geodesic * luck.uniform(0, 2, n)),
         "collisions": luck.poisson(1.0, n),
     }
+    places = np.where(level == "same", rows.WHERE[0], luck.choice(rows.WHERE[1:], n))
+    columns["where"] = np.where(solved, "", places)
+    columns["how"] = np.where(solved, "", np.where(outcome == "fall", rows.HOW[0], luck.choice(rows.HOW[1:], n)))
     made = {
         "scale": "smoke",
         "commit": "0123456789abcdef",

@@ -138,7 +138,7 @@ class RowFile:
         """
         success = np.isfinite(columns["success_time"])
         ended = np.isin(columns["outcome"], OUTCOMES) & ((columns["outcome"] == "success") == success)
-        for name, ok in {**holds, "outcome": ended}.items():
+        for name, ok in {"outcome": ended, **holds}.items():
             if not np.all(ok):
                 worst = int(np.argmin(ok))
                 value = columns[name][worst]

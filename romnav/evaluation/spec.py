@@ -14,6 +14,8 @@ from romnav.safety.spec import SafetySpec
 from romnav.sensing.spec import CorruptionSpec, LidarSpec
 from romnav.world.spec import SamplerSpec, WorldSpec
 
+ROWS_VERSION = 2
+"""Of the schema of episode rows; rows of an earlier one are out of date."""
 METRICS = Kind("metric", "romnav.metrics", "romnav.evaluation.paired.metrics:Measure")
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from romnav.evaluation import episodes, tracks
 from romnav.evaluation.paired import rows
+from romnav.evaluation.paired.failures import classify
 from romnav.evaluation.paired.run import run
 from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.evaluation.rollout import SCRIPTED
@@ -73,13 +75,15 @@ def _gallery(name: str, drawn: episodes.EpisodeSet, world: episodes.World) -> Ep
         "episode": range(count),
         "tile_class": [str(world.tiles[t].kind) for t in drawn.columns["tile"]],
         "multi_story": [world.tiles[t].multi_story for t in drawn.columns["tile"]],
-        "level": ["cross" if cross else "same" for cross in drawn.cross],
+        "level": np.where(drawn.cross, "cross", "same"),
         **{key: values for key, values in drawn.columns.items() if key in rows.SCHEMA.names},
         **measured,
     }
+    ways = recorder.tracks(count)
+    columns["where"], columns["how"] = classify(ways, columns, world, EnvSpec().period)
     provenance = rows.Provenance(
         scale="smoke", commit="0123456789abcdef", spec_hash="spec", checkpoint_sha256=None,
         episode_set=drawn.digest, version="0.1.0", steps=0, hours=0.0, machine="2 cores",
     )  # fmt: skip
     made = rows.make(columns, provenance, f"results/smoke/{name}/seed-0/episodes.parquet")
-    return EpisodeGallery(made, recorder.tracks(count), drawn, world)
+    return EpisodeGallery(made, ways, drawn, world)

@@ -1,4 +1,9 @@
-"""Why episodes fail: where the robot got to, and what it did in the end."""
+"""Why episodes fail: where the robot got to, and what it did in the end.
+
+The end is the last `WINDOW` seconds, and what it did is the first that holds: it fell; it touched something for half of
+the time (pressed); it stayed within `STANDING` (stood); it walked `ROUNDS` times the diagonal of what it covered
+(circled); anything else (roamed).
+"""
 
 from __future__ import annotations
 
@@ -11,11 +16,6 @@ from romnav.evaluation.tracks import Tracks
 from romnav.world.solids import Label
 from romnav.world.world import LEVEL_GAP, World
 
-WHERE = ("same level", "never on a stair", "on a stair", "on the goal's level")
-"""How far the robot got: goals on the spawn's level, and for the others the last that it reached."""
-HOW = ("fell", "pressed", "stood", "circled", "roamed")
-"""What it did in the last `WINDOW` seconds, the first that holds: fell; touched something for half of the time; stayed
-within `STANDING`; walked `ROUNDS` times the diagonal of what it covered; anything else."""
 WINDOW = 20.0
 """Time before the end that is looked at, s."""
 STANDING = 1.0
@@ -24,20 +24,17 @@ ROUNDS = 3.0
 """Length of the way over the diagonal of its bounding box from which on it counts as circling."""
 
 
-def classify(
-    tracks: Tracks, rows: Mapping[str, NDArray], tile: NDArray, world: World, period: float
-) -> tuple[NDArray, NDArray]:
+def classify(tracks: Tracks, rows: Mapping[str, NDArray], world: World, period: float) -> tuple[NDArray, NDArray]:
     """Classes of the failed episodes.
 
     Args:
         tracks: Of the ``n`` episodes.
         rows: Columns of their rows.
-        tile: (n,) tiles of ``world`` that they took place on.
         world: The terrain.
         period: Time between samples, s.
 
     Returns:
-        Where and how, each (n,) strings of `WHERE` and `HOW`; empty where the goal was reached.
+        Where and how, each (n,) strings of `rows.WHERE` and `rows.HOW`; empty where the goal was reached.
     """
     where = np.full(len(tracks), "", dtype=object)
     how = where.copy()
@@ -48,7 +45,7 @@ def classify(
             where[episode] = "same level"
         else:
             floor = np.abs(position[:, 2] - rows["goal_z"][episode]) <= LEVEL_GAP
-            climbed = on_connector(world, int(tile[episode]), position).any()
+            climbed = on_connector(world, int(rows["tile"][episode]), position).any()
             where[episode] = "on the goal's level" if floor.any() else "on a stair" if climbed else "never on a stair"
         how[episode] = "fell" if rows["outcome"][episode] == "fall" else _how(position[:, :2], contact, period)
     return where, how

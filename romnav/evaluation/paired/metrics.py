@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from romnav.evaluation import spec as specs
-from romnav.evaluation.paired.rows import HORIZONS, SUCCESS_RADIUS
+from romnav.evaluation.paired.rows import HORIZONS, HOW, SUCCESS_RADIUS, WHERE
 
 Level = Literal["all", "same", "cross"]
 LEVELS: tuple[Level, ...] = ("all", "same", "cross")
 Direction = Literal["higher", "lower"]
+_PLACES = dict(zip(("no_stair", "on_stair", "on_level"), WHERE[1:], strict=True))
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,13 @@ METRICS: dict[str, Metric] = {
     ),
     "falls": _rate("Falls", "episodes in which the robot fell", "falls", "lower"),
     "timeouts": _rate("Timeouts", "episodes whose time ran out", "timeouts", "lower"),
+    "pressed": _rate("Pressed", "failures that touched something for half of the last 20 s", "pressed", "lower"),
+    "stood": _rate("Stood", "failures that stayed within 1 m in the last 20 s", "stood", "lower"),
+    "circled": _rate("Circled", "failures that walked round and round in the last 20 s", "circled", "lower"),
+    "roamed": _rate("Roamed", "failures that walked elsewhere in the last 20 s", "roamed", "lower"),
+    "no_stair": _rate("No stair", "failures across levels that never set foot on a stair", "no_stair", "lower"),
+    "on_stair": _rate("On stair", "failures across levels that got onto a stair", "on_stair", "lower"),
+    "on_level": _rate("On level", "failures across levels that got onto the goal's", "on_level", "lower"),
     "collisions": Metric(
         "Contact", "steps with contact per 100 m walked", "collisions", "path", 100.0, "per 100 m", "lower"
     ),
@@ -141,6 +149,8 @@ def quantities(columns: Mapping[str, NDArray], outside: Iterable[str] = ()) -> d
         "soft_spl": progress * efficiency,
         "falls": (columns["outcome"] == "fall").astype(float),
         "timeouts": (columns["outcome"] == "timeout").astype(float),
+        **{how: (columns["how"] == how).astype(float) for how in HOW[1:]},
+        **{name: (columns["where"] == where).astype(float) for name, where in _PLACES.items()},
         "collisions": columns["collisions"].astype(float),
         "path": path,
         **{f"{name} numerator": np.asarray(_load(name).numerator(columns), float) for name in outside},

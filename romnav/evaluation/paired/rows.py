@@ -12,11 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from romnav.errors import RomnavError
 from romnav.evaluation.rowfile import POSES, Provenance, RowFile
+from romnav.evaluation.spec import ROWS_VERSION
 
 HORIZONS = (45, 120)
 """Evaluation horizons, s (paper, Sec. IV-A): the training budget, and the end of an episode."""
 SUCCESS_RADIUS = 0.5
 """Distance to the goal that counts as success, m (paper, Sec. IV-A)."""
+WHERE = ("same level", "never on a stair", "on a stair", "on the goal's level")
+"""How far the robot of a failed episode got: goals on the spawn's level; for the others, the last that it reached."""
+HOW = ("fell", "pressed", "stood", "circled", "roamed")
+"""What it did in the end, see `failures`."""
 
 SCHEMA = pa.schema(
     [
@@ -35,9 +40,11 @@ SCHEMA = pa.schema(
         pa.field("path_length", pa.float64()),  # planar, sampled at 5 Hz until the end, m
         pa.field("final_distance", pa.float64()),  # geodesic, at the end, m; may be infinite
         pa.field("collisions", pa.int64()),  # steps with contact
+        pa.field("where", pa.string()),  # one of WHERE; empty where the goal was reached
+        pa.field("how", pa.string()),  # one of HOW; likewise
     ]
 )
-FILE = RowFile("rows", version=1, schema=SCHEMA, again="evaluate the arm again", compression="snappy")
+FILE = RowFile("rows", version=ROWS_VERSION, schema=SCHEMA, again="evaluate the arm again", compression="snappy")
 
 
 @dataclass(frozen=True)
@@ -113,7 +120,7 @@ def _check(c: Mapping[str, NDArray], source: str) -> None:
     if not np.array_equal(episodes, np.arange(n)):
         missing = np.setdiff1d(np.arange(episodes[-1] + 1), episodes)
         raise RomnavError(f"{source}: episode(s) {_some(missing)} missing; evaluate the arm again")
-    time = c["success_time"]
+    time, failed = c["success_time"], c["outcome"] != "success"
     holds: dict[str, NDArray] = {
         "arm": c["arm"] == c["arm"][0],
         "seed": c["seed"] == c["seed"][0],
@@ -122,6 +129,8 @@ def _check(c: Mapping[str, NDArray], source: str) -> None:
         "success_time": np.isnan(time) | ((time >= 0) & (time <= HORIZONS[-1])),
         "final_distance": c["final_distance"] >= 0,
         "collisions": c["collisions"] >= 0,
+        "where": np.where(failed, np.isin(c["where"], WHERE), c["where"] == ""),
+        "how": np.where(failed, np.isin(c["how"], HOW), c["how"] == ""),
         **{name: np.isfinite(c[name]) & (c[name] >= 0) for name in ("geodesic", "time", "path_length")},
         **{name: np.isfinite(c[name]) for name in POSES},
     }

@@ -66,7 +66,7 @@ class Stage:
     make: Callable[[Stage, Session, Progress], dict[str, Any]] = field(compare=False)
     """Makes the output and returns facts worth recording, e.g. its training steps."""
     code: tuple[str, ...] = ()
-    """Parts from outside that make its output beside those in its settings, with the digests of their source."""
+    """What makes its output beside its settings: the format, parts from outside with the digests of their source."""
     reads: tuple[Path, ...] = ()
     """Versioned files that its output depends on."""
     upstream: tuple[Stage, ...] = ()

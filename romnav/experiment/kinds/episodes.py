@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from romnav.errors import RomnavError
+from romnav.evaluation.spec import ROWS_VERSION
 from romnav.experiment.graph.run import missing
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
@@ -35,7 +36,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         uses=("evaluation", *driven.uses),
         make=partial(_evaluate, driven),
         reads=(paired_set(work),),
-        code=driven.code,
+        code=(f"rows {ROWS_VERSION}", *driven.code),
         upstream=driven.upstream,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
@@ -65,8 +66,11 @@ def paired_set(work: Workspace) -> Path:
 
 
 def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    import numpy as np
+
     from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import rows
+    from romnav.evaluation.paired.failures import classify
     from romnav.evaluation.paired.run import run
     from romnav.evaluation.tracks import Recorder, write
 
@@ -88,10 +92,13 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
         **{name: values for name, values in paired.columns.items() if name in rows.SCHEMA.names},
         **measured,
     }
+    tracks, period = recorder.tracks(count), settings.navigation.env.period
+    columns["level"] = np.asarray(columns["level"])
+    columns["where"], columns["how"] = classify(tracks, columns, world, period)
     provenance = driven.provenance(stage, paired.digest, settings.evaluation)
     rows.write(stage.folder / "episodes.parquet", rows.make(columns, provenance))
     source = {name: str(value) for name, value in provenance.model_dump().items()}
-    write(stage.folder / "tracks.npz", recorder.tracks(count), source)
+    write(stage.folder / "tracks.npz", tracks, source)
     return {}
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.intervals import wilson
-from romnav.evaluation.paired.failures import HOW, WHERE
+from romnav.evaluation.paired.rows import HOW, WHERE
 from romnav.evaluation.tracks import RESOLUTION
 from romnav.navigation.spec import EnvSpec
 from romnav.report.paired.gallery import EpisodeGallery

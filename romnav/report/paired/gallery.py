@@ -10,10 +10,8 @@ import pandas as pd
 
 from romnav.errors import RomnavError
 from romnav.evaluation.episodes import EpisodeSet
-from romnav.evaluation.paired.failures import HOW, WHERE, classify
-from romnav.evaluation.paired.rows import EpisodeRows
+from romnav.evaluation.paired.rows import HOW, WHERE, EpisodeRows
 from romnav.evaluation.tracks import Tracks
-from romnav.navigation.spec import EnvSpec
 from romnav.report.paired.maps import draw_maps
 from romnav.world.world import World
 
@@ -26,11 +24,9 @@ class EpisodeGallery:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The rows with ``climb``, m, and the classes ``where`` and ``how`` of the failures."""
+        """The rows with ``climb``, m."""
         table = pd.DataFrame(dict(self.run.columns))
-        tile = self.episodes.columns["tile"]
-        where, how = classify(self.tracks, self.run.columns, tile, self.world, EnvSpec().period)
-        return table.assign(climb=(table.goal_z - table.spawn_z).abs(), where=where, how=how)
+        return table.assign(climb=(table.goal_z - table.spawn_z).abs())
 
     def choose(self, failed: bool, where: str | None) -> Sequence[int]:
         """Episodes that ``where``, an expression over the columns of the table, is true of.

@@ -51,7 +51,8 @@ def failures(driver: object, world: World, paired: EpisodeSet, duration: float) 
     recorder = Recorder()
     out = run(driver, world, paired, EnvSpec(), EvaluationSpec(duration=duration), recorder=recorder)
     rows = {**out, "goal_z": paired.columns["goal_z"], "level": np.where(paired.cross, "cross", "same")}
-    where, how = classify(recorder.tracks(len(paired)), rows, paired.columns["tile"], world, 0.2)
+    rows["tile"] = paired.columns["tile"]
+    where, how = classify(recorder.tracks(len(paired)), rows, world, 0.2)
     assert ((where == "") == (out["outcome"] == "success")).all()
     assert ((how == "") == (where == "")).all()
     return where, how, out["outcome"] != "success"
@@ -81,8 +82,9 @@ def test_who_knows_the_way_was_on_a_stair_or_on_the_level(world: World, paired: 
     recorder = Recorder()
     out = run(Oracle(), world, paired, EnvSpec(), EvaluationSpec(duration=12.0), recorder=recorder)
     rows = {**out, "goal_z": paired.columns["goal_z"], "level": np.where(paired.cross, "cross", "same")}
+    rows["tile"] = paired.columns["tile"]
     tracks = recorder.tracks(len(paired))
-    where, how = classify(tracks, rows, paired.columns["tile"], world, 0.2)
+    where, how = classify(tracks, rows, world, 0.2)
     failed = np.flatnonzero(out["outcome"] == "timeout")
     assert len(failed) > 10
     assert (how[failed] == "roamed").mean() > 0.9

@@ -20,6 +20,8 @@ def columns(**changes: object) -> dict[str, np.ndarray]:
         "path_length": [10.0, 40.0, 5.0, 45.0],
         "final_distance": [0.2, 0.4, 5.0, 12.0],
         "collisions": [0, 3, 1, 6],
+        "where": ["", "", "on a stair", "same level"],
+        "how": ["", "", "fell", "circled"],
     }
     return {name: np.array(value) for name, value in {**base, **changes}.items()}
 
@@ -35,6 +37,7 @@ def test_by_hand() -> None:
     assert m["falls"] == 25
     assert m["timeouts"] == 25
     assert m["collisions"] == pytest.approx(10.0)
+    assert (m["circled"], m["pressed"], m["on_stair"], m["no_stair"]) == (25, 0, 25, 0)
 
 
 def test_by_level() -> None:
@@ -76,6 +79,8 @@ def test_bounds_and_order(n: int, seed: int, skill: float) -> None:
         path_length=rng.uniform(0, 60, n),
         final_distance=rng.uniform(0, 40, n),
         collisions=rng.poisson(2, n),
+        where=np.where(solved, "", rng.choice(rows.WHERE, n)),
+        how=np.where(solved, "", rng.choice(rows.HOW, n)),
     )
     m = metrics.evaluate(sample)
     assert 0 <= m["sr_45"] <= m["sr_120"] <= 100

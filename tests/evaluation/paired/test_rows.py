@@ -63,6 +63,8 @@ def test_rows_are_put_in_order_of_the_episodes(episode_rows) -> None:
         ("final_distance", np.nan, "impossible final_distance"),
         ("goal_z", np.nan, "impossible goal_z"),
         ("collisions", -1, "impossible collisions"),
+        ("where", "on the moon", "impossible where"),
+        ("how", "flew", "impossible how"),
         ("arm", "other", "impossible arm"),
         ("episode", 6, "occur twice"),
         ("episode", 99, "5, 64, 65, ... .36 in all. missing"),
@@ -114,7 +116,7 @@ def test_unreadable_files_are_named(episode_rows, tmp_path: Path) -> None:
     table = pq.read_table(whole)
     metadata = dict(table.schema.metadata)
     pq.write_table(table.replace_schema_metadata({**metadata, b"romnav.rows": b"99"}), path)
-    with pytest.raises(RomnavError, match="schema version 99, not 1"):
+    with pytest.raises(RomnavError, match="schema version 99, not 2"):
         rows.read(path)
     broken = metadata[b"romnav.provenance"].replace(b'"scale"', b'"scald"')
     pq.write_table(table.replace_schema_metadata({**metadata, b"romnav.provenance": broken}), path)

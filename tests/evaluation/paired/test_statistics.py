@@ -106,6 +106,8 @@ def test_tiles_as_units_widen_the_interval_of_alike_episodes(episode_rows) -> No
         **b.columns,
         "success_time": np.where(lost, np.nan, a.columns["success_time"]),
         "outcome": np.where(lost, "fall", a.columns["outcome"]),
+        "where": np.where(lost, rows.WHERE[0], a.columns["where"]),
+        "how": np.where(lost, rows.HOW[0], a.columns["how"]),
     }
     pair = rows.pair([a, rows.make(columns, b.provenance)])
     by_episode, by_tile = (Bootstrap(pair, cluster=c).contrast("a", "b") for c in ("episode", "tile"))
