@@ -97,8 +97,10 @@ def _judge(
     """Those that were judged before are not walked again."""
     from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import progress as along
+    from romnav.evaluation.paired.failures import classify
     from romnav.evaluation.paired.run import run
     from romnav.evaluation.rollout import Policy
+    from romnav.evaluation.tracks import Recorder
     from romnav.navigation import checkpoint
 
     settings, path = work.arm_settings(str(trained.arm)), stage.reads[0]
@@ -117,10 +119,13 @@ def _judge(
             continue
         driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
         robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
-        measured = run(driver, world, episodes, settings.navigation.env, settings.evaluation, progress, robots)
+        env, recorder = settings.navigation.env, Recorder()
+        measured = run(driver, world, episodes, env, settings.evaluation, progress, robots, recorder)
+        walked = columns | measured
+        where, how = classify(recorder.tracks(len(episodes)), walked, world, env.period)
         saved = checkpoint.read(file)
         place = {"policy": name, "episodes": episodes.digest, "iteration": int(file.stem)}
         place |= {"steps": saved["steps"], "hours": saved["hours"]}
-        rows[name] = place | along.row(columns | measured)
+        rows[name] = place | along.row({**walked, "where": where, "how": how})
         files.write(stage.folder / "kept.csv", along.text(list(rows.values())))
     return {"policies": len(policies)}
