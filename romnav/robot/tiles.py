@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.robot.statics import BOX, CYLINDER, MESH, Geoms
 from romnav.world.solids import Shape, Solids
 from romnav.world.tile import Tile
@@ -16,6 +17,10 @@ CELL = 0.025
 """Cell of the height maps, m: a tenth of a tread."""
 NOWHERE = -32768
 """Height, mm, where a layer has no walking surface."""
+BLOCK = 32
+"""Cells along a block of a height map."""
+
+wp.set_module_options({"enable_backward": False})
 
 
 def geoms(solids: Solids) -> Geoms:
@@ -75,8 +80,41 @@ def surfaces(tile: Tile, cell: float = CELL) -> NDArray[np.int16]:
     return heights
 
 
+@wp.kernel
+def _highest(
+    blocks: wp.array3d(dtype=wp.int16),
+    table: wp.array4d(dtype=wp.int32),
+    tile: wp.array(dtype=wp.int64),
+    cells: int,
+    points: wp.array2d(dtype=wp.vec2),
+    reach: wp.array2d(dtype=float),
+    heights: wp.array2d(dtype=float),
+):
+    robot, k = wp.tid()
+    # what is not finite is nowhere
+    at = wp.vec2()
+    if wp.isfinite(points[robot, k]):
+        at = points[robot, k]
+    ix = int(wp.clamp(wp.floor(at[0] / CELL), 0.0, float(cells - 1)))
+    iy = int(wp.clamp(wp.floor(at[1] / CELL), 0.0, float(cells - 1)))
+    found = bool(False)
+    best = float(0.0)
+    for layer in range(table.shape[1]):
+        block = table[int(tile[robot]), layer, ix // BLOCK, iy // BLOCK]
+        if block >= 0:
+            height = blocks[block, ix % BLOCK, iy % BLOCK]
+            if height != wp.int16(NOWHERE):
+                z = float(height) / 1000.0
+                if z <= reach[robot, k] and (z > best or not found):
+                    best = z
+                    found = True
+    heights[robot, k] = best
+
+
 class TileHeights:
     """Walking surfaces under robots that are each on a tile of their own; called like a `HeightMap`.
+
+    A map is made of blocks, and those of a tile that are alike are kept once, since most of a floor is flat.
 
     Attributes:
         tile: (n,) of each robot.
@@ -84,33 +122,56 @@ class TileHeights:
 
     def __init__(self, tiles: tuple[Tile, ...]) -> None:
         self._tiles = tiles
-        self._slot = torch.full((len(tiles),), -1, dtype=torch.long)
-        self._layers = max(len(tile.layers) for tile in tiles)
-        self._maps = torch.empty(0)
+        self._cells = round(tiles[0].side / CELL)
+        side, layers = -(-self._cells // BLOCK), max(len(tile.layers) for tile in tiles)
+        self._made = np.zeros(len(tiles), bool)
+        # block of each tile, layer and place, -1 where there is no surface
+        self._table = torch.full((len(tiles), layers, side, side), -1, dtype=torch.int32)
+        self._blocks = torch.empty(0, BLOCK, BLOCK, dtype=torch.int16)
         self.tile = torch.empty(0, dtype=torch.long)
 
     def place(self, tile: Tensor) -> None:
         """Robots are on tiles (n,) now; heights of new tiles are made."""
         self.tile = tile.clone()
-        new = [t for t in tile.unique().tolist() if self._slot[t] < 0]
-        made: list[NDArray[np.int16]] = []
-        for t in new:
-            self._slot[t] = len(self._maps) + len(made)
-            layers = surfaces(self._tiles[t])
-            made.append(np.pad(layers, ((0, self._layers - len(layers)), (0, 0), (0, 0)), constant_values=NOWHERE))
-        if made:
-            fresh = torch.from_numpy(np.stack(made))
-            self._maps = torch.cat([self._maps, fresh]) if len(self._maps) else fresh
+        made = [self._blocks]
+        for t in tile.unique().tolist():
+            if not self._made[t]:
+                table, blocks = _cut(surfaces(self._tiles[t]))
+                table[table >= 0] += sum(map(len, made))
+                self._table[t, : len(table)] = torch.from_numpy(table)
+                made.append(torch.from_numpy(blocks))
+                self._made[t] = True
+        if len(made) > 1:
+            self._blocks = torch.cat(made)
+        self._maps = [wp.from_torch(part) for part in (self._blocks, self._table, self.tile)]
 
     def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
         """Height (n, ...) of the highest surface not above `reach` under points (n, ..., 2); 0 where there is none."""
-        index = (points / CELL).floor().long().clamp(0, self._maps.shape[-1] - 1)
-        slot = self._slot[self.tile].reshape(-1, *[1] * (points.ndim - 2))
-        at = self._maps[slot, :, index[..., 0], index[..., 1]]
-        height = at.float() / 1000
-        allowed = (at != NOWHERE) & (height <= reach[..., None])
-        below = torch.where(allowed, height, -torch.inf).amax(-1)
-        return torch.where(below.isfinite(), below, 0.0)
+        shape = points.shape[:-1]
+        heights = torch.empty(len(points), shape[1:].numel())
+        inputs = [
+            *self._maps,
+            self._cells,
+            wp.from_torch(points.reshape(*heights.shape, 2).contiguous(), dtype=wp.vec2),
+            wp.from_torch(reach.expand(shape).reshape(heights.shape).contiguous()),
+        ]
+        wp.launch(_highest, heights.shape, inputs, [wp.from_torch(heights)], device="cpu")
+        return heights.reshape(shape)
+
+
+def _cut(layers: NDArray[np.int16]) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
+    """A map (L, N, N) as blocks (k, `BLOCK`, `BLOCK`), no two alike, and which of them is where, (L, m, m); -1 where
+    there is no surface."""
+    side = -(-layers.shape[1] // BLOCK)
+    beyond = side * BLOCK - layers.shape[1]
+    padded = np.pad(layers, ((0, 0), (0, beyond), (0, beyond)), constant_values=NOWHERE)
+    cut = padded.reshape(-1, side, BLOCK, side, BLOCK).swapaxes(2, 3).reshape(-1, BLOCK * BLOCK)
+    # as single values, which sort far faster than rows
+    rows = np.ascontiguousarray(cut).view(np.dtype((np.void, cut.itemsize * cut.shape[1])))[:, 0]
+    _, first, which = np.unique(rows, return_index=True, return_inverse=True)
+    table = which.astype(np.int32)
+    table[(cut == NOWHERE).all(1)] = -1
+    return table.reshape(-1, side, side), cut[first].reshape(-1, BLOCK, BLOCK)
 
 
 def change_layer(world: World, tile: Tensor, layer: Tensor, xy: Tensor, z: Tensor) -> Tensor:
