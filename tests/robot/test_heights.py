@@ -1,4 +1,4 @@
-"""Tiles under the humanoid: geoms and heights against each other."""
+"""Heights of tiles against the geoms, and against the maps as they are drawn."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from romnav.robot.heights import CELL, NOWHERE, TileHeights, surfaces
 from romnav.robot.statics import OBSTACLES
-from romnav.robot.tiles import CELL, NOWHERE, TileHeights, geoms, surfaces
+from romnav.robot.tiles import geoms
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Tile
 from romnav.world.tiles import generate
