@@ -14,9 +14,10 @@ from romnav.errors import RomnavError
 from romnav.robot.dynamics import Head
 from romnav.robot.g1 import HEAD, Humanoids
 from romnav.robot.gaits import Gait, GaitLibrary
+from romnav.robot.heights import TileHeights
 from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
-from romnav.robot.tiles import TileHeights, change_layer, geoms
+from romnav.robot.tiles import change_layer, geoms
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.world import World
