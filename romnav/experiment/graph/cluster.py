@@ -61,6 +61,7 @@ def execute_on_ray(
     try:
         import ray
         from ray.util.queue import Queue as RayQueue
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
     except ImportError as error:
         raise RomnavError("--on ray: Ray is not installed; run `pip install 'romnav[ray]'`") from error
     stages = list(stages)
@@ -73,7 +74,8 @@ def execute_on_ray(
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise RomnavError(f"--on {address}: {str(error).splitlines()[0]}; is the cluster there?") from error
     try:
-        queue = RayQueue(actor_options={"num_cpus": 0})
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+        queue = RayQueue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
         task = ray.remote(**needs, max_retries=RETRIES)(_run)
         running: dict[str, Any] = {}
         for stage in stages:
@@ -91,7 +93,8 @@ def execute_on_ray(
                 _stop(ray, list(running.values()))
                 raise
             finally:
-                queue.put(None)
+                with contextlib.suppress(Exception):  # the cluster may have gone
+                    queue.put(None)
                 shown.join(5.0)
     finally:
         ray.shutdown()
@@ -143,5 +146,6 @@ class _Lines(io.TextIOBase):
     def write(self, text: str) -> int:
         *whole, self._rest = (self._rest + text).split("\n")
         for line in filter(None, whole):
-            self._queue.put((self._name, line))
+            with contextlib.suppress(Exception):  # that nobody is told of it stops no stage
+                self._queue.put((self._name, line))
         return len(text)
