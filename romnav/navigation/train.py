@@ -15,9 +15,9 @@ from tensordict import TensorDict
 
 from romnav import files, stopping
 from romnav.errors import RomnavError
+from romnav.journal import Journal
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
-from romnav.navigation.journal import Journal
 from romnav.navigation.kickstart import KickstartedPPO, Teacher, blank_lesson
 from romnav.navigation.perception import Perception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
@@ -138,7 +138,7 @@ def _train(
             cpu_seconds = cpu_before + time.process_time() - cpu_started
             curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate) | ppo.report())
             _check_finite(state, done, curve[-1], ppo)
-            journal.add(curve[-1])
+            journal.add(done * steps, curve[-1])
             if progress:
                 progress(done * steps, total * steps, _summary(curve))
             if spec.ppo.keep and done % spec.ppo.keep == 0:
@@ -174,7 +174,8 @@ def _learner(
 
 
 def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:
-    content = {**identity, "actor": ppo.actor.state_dict(), "steps": steps, "hours": seconds / 3600}
+    networks = {"actor": ppo.actor.state_dict(), "critic": ppo.critic.state_dict()}
+    content = {**identity, **networks, "steps": steps, "hours": seconds / 3600}
     checkpoint.save(path, content)
 
 
