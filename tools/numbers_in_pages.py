@@ -56,20 +56,20 @@ def value(source: str) -> str:
         number = {".json": _of_json, ".csv": _of_csv}[path.suffix](path, *keys)
         factor, _, form = form.rpartition("*")
         return f"{number * float(factor or 1):{form}}"
-    except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
         raise SourceError(f"{source}: {error}") from error
 
 
 def _of_json(path: Path, *keys: str) -> float:
     content = json.loads(path.read_text("utf-8"))
-    return sum(_at(content, key) for key in keys)
+    return sum([_at(content, key) for key in keys])
 
 
 def _at(found: Any, keys: str) -> float:
     for key in keys.split("/"):
         name, _, wanted = key.partition("=")
         if wanted:
-            found = next(item for item in found if str(item[name]) == wanted)
+            (found,) = [item for item in found if str(item[name]) == wanted]
         else:
             found = found[int(name)] if isinstance(found, list) else found[name]
     return float(found)
