@@ -34,7 +34,7 @@ PARTS = {
     "physics": ("step", "mujoco._batch"),
     "surroundings": ("_surround", "g1.py"),
     "reference gait, with": ("update", "lip.py"),
-    "heights of the ground": ("__call__", "tiles.py"),
+    "heights of the ground": ("__call__", "heights.py"),
     "inverse kinematics": ("inverse", "legs.py"),
     "observation": ("observe", "control.py"),
     "policy": ("policy", "train.py"),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
@@ -12,10 +13,13 @@ from romnav.config import Config, Count, Positive
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import DeploymentSpec, EvaluationSpec, TrialSpec
 from romnav.experiment.spec import Experiment, parse, read_toml, suggest
-from romnav.navigation.spec import MOST_STEPS, KickstartSpec, NavigationSpec
+from romnav.navigation.spec import BODIES, MOST_STEPS, KickstartSpec, NavigationSpec
 from romnav.robot.spec import LocomotionSpec
 from romnav.sensing.spec import DepthPretrainSpec, DepthSpec, LidarSpec, PretrainSpec, QualitySpec
 from romnav.world.spec import WorldSpec
+
+SHARED = ("bodies", "locomotion", "evaluation", "safety", "deploy")
+"""Sections that are the same for all arms."""
 
 
 class ResourcesSpec(Config):
@@ -58,6 +62,9 @@ class Scale(Config):
     """Trials in the deployments."""
     resources: ResourcesSpec = ResourcesSpec()
     """Share of a machine that a stage takes on a cluster."""
+    bodies: dict[Annotated[str, BODIES], dict[str, Any]] = Field(default={})
+    """Settings that differ where another body is trained, e.g. ``bodies.g1.navigation.env.envs = 96``. They come before
+    those of the arm."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -96,7 +103,14 @@ class ScaleFile:
         file = known[name]
         self.name = name
         self._data = read_toml(file)
-        self.settings = parse(Scale, self._data, file)
+        self._bodies = parse(Scale, self._data, file).bodies
+        for body, change in self._bodies.items():
+            key = f"bodies.{body}"
+            _refuse_shared(file, key, change)
+            driven = _merge(self._data, {"navigation": {"dynamics": body}})
+            if parse(Scale, _merge(driven, change), file, f"{key}.").navigation.dynamics != body:
+                raise RomnavError(f"{file}: {key}.navigation.dynamics: it is {body} here; leave it out")
+        self.settings = parse(Scale, self._on_its_body(), file)
 
     def changed(self, name: str, experiment: Experiment, file: Path) -> Scale:
         """The settings of arm ``name`` of the ``experiment`` in ``file``.
@@ -105,15 +119,25 @@ class ScaleFile:
             RomnavError: The arm, or the experiment at this scale, changes a setting that does not exist, or to a value
                 of a wrong type.
         """
-        data = self._data
         shared, own = experiment.scales.get(self.name, {}), experiment.arms[name].changes
+        data = self._on_its_body(shared, own)
         for key, change in ((f"scales.{self.name}", shared), (f"arms.{name}", own)):
-            for common in ("locomotion", "evaluation", "safety", "deploy"):
-                if common in change:
-                    raise RomnavError(f"{file}: {key}.{common}: set it in the scale, all arms share it")
+            _refuse_shared(file, key, change)
             data = _merge(data, change)
             settings = parse(Scale, data, file, f"{key}.")
         return settings
+
+    def _on_its_body(self, *changes: Mapping[str, Any]) -> dict[str, Any]:
+        """The scale for the body that it has after some changes, without these."""
+        navigation = reduce(_merge, changes, self._data).get("navigation")
+        body = navigation.get("dynamics", "rom") if isinstance(navigation, dict) else None
+        return _merge(self._data, self._bodies.get(str(body), {}))
+
+
+def _refuse_shared(file: Path, key: str, change: Mapping[str, Any]) -> None:
+    for section in SHARED:
+        if section in change:
+            raise RomnavError(f"{file}: {key}.{section}: set [{section}] of the scale, all arms share it")
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

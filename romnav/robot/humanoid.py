@@ -16,11 +16,12 @@ from romnav.errors import RomnavError
 from romnav.robot.dynamics import Head
 from romnav.robot.g1 import HEAD, Humanoids, build_spec
 from romnav.robot.gaits import Gait, GaitLibrary
+from romnav.robot.heights import TileHeights
 from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
 from romnav.robot.spec import RobotSpec
 from romnav.robot.statics import NOTHING
-from romnav.robot.tiles import TileHeights, change_layer, geoms
+from romnav.robot.tiles import change_layer, geoms
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.world import World
@@ -83,6 +84,7 @@ class Humanoid:
         seed: int = 0,
         threads: int = 0,
         stair_speed: float | None = None,
+        first: int = 0,
     ) -> None:
         """
         Args:
@@ -94,6 +96,7 @@ class Humanoid:
             seed: of first feet and times along gaits.
             threads: of the physics; 0 means all cores. They do not change the result.
             stair_speed: fastest forward command followed while the next foothold is not level with the feet, m/s.
+            first: number of the first robot, where those before it are elsewhere; what is drawn depends on numbers.
 
         Raises:
             RomnavError: the checkpoint is missing, or the period is no multiple of the control step.
@@ -108,7 +111,7 @@ class Humanoid:
         self.yaw = torch.zeros(envs)
         self.contacts = torch.zeros(envs)
         self.fallen = torch.zeros(envs, dtype=torch.bool)
-        self._env = torch.arange(envs)
+        self._env = torch.arange(first, first + envs)
         self._resets = torch.zeros(envs, dtype=torch.int64)
         self._first = torch.ones(envs, dtype=torch.bool)
         self.robots = Humanoids(self._spec.robot, [geoms(tile.solids) for tile in world.tiles], envs, threads=threads)

@@ -22,6 +22,8 @@ STOREY, TWO_STOREYS = 3.5, 7.5
 """Least climb that counts as one storey and as two, m."""
 MOUTH_RADIUS = 1.0
 """A spawn this near to the end of a stair or ramp is at its mouth, m (A)."""
+SOLVED_AT_ONCE = 16
+"""Tiles whose geodesics are computed together: enough for many workers, few enough to hold beside the result."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,16 @@ def pack(
         height[t, :n] = g.height
         switch[t, 1:n] = g.switch
         spawn.append(np.flatnonzero(_stair_spawns(tile, g)) + node_start[t])
-    paths = solve(list(grids), [np.asarray(g) for g in goals])
     per_goal = np.repeat([len(g.position) for g in grids], [len(g) for g in goals])
+    fields, bends = np.empty(per_goal.sum(), np.uint16), np.empty(per_goal.sum(), np.uint16)
+    paths, done = [], 0
+    for first in range(0, len(tiles), SOLVED_AT_ONCE):
+        some = slice(first, first + SOLVED_AT_ONCE)
+        for path in solve(list(grids[some]), [np.asarray(g) for g in goals[some]]):
+            part = slice(done, done := done + path.distance.size)
+            fields[part], bends[part] = path.distance.ravel(), path.source.ravel()
+            paths.append((path.corner, path.outward, path.reach))
+    corner, outward, reach = zip(*paths, strict=True)
     return World(
         spec=spec,
         tiles=tuple(tiles),
@@ -145,12 +155,12 @@ def pack(
         goal=torch.from_numpy(np.concatenate([g + s for g, s in zip(goals, node_start, strict=False)])),
         goal_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(g) for g in goals])])),
         field_start=torch.from_numpy(np.concatenate([[0], np.cumsum(per_goal)[:-1]])),
-        fields=torch.from_numpy(np.concatenate([p.distance.ravel() for p in paths])),
-        bends=torch.from_numpy(np.concatenate([p.source.ravel() for p in paths])),
-        corner=torch.from_numpy(np.concatenate([p.corner for p in paths])),
-        outward=torch.from_numpy(np.concatenate([p.outward for p in paths])),
-        corner_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(p.corner) for p in paths])])),
-        reach=torch.from_numpy(np.concatenate([p.reach.ravel() for p in paths])),
+        fields=torch.from_numpy(fields),
+        bends=torch.from_numpy(bends),
+        corner=torch.from_numpy(np.concatenate(corner)),
+        outward=torch.from_numpy(np.concatenate(outward)),
+        corner_start=torch.from_numpy(np.concatenate([[0], np.cumsum([len(c) for c in corner])])),
+        reach=torch.from_numpy(np.concatenate([r.ravel() for r in reach])),
     )
 
 

@@ -160,7 +160,7 @@ def test_an_arm_changes_only_what_it_names(scales: Path) -> None:
         ("navigaton.env.envs = 3", "unknown key arms.slow.navigaton; did you mean navigation?"),
         ('navigation.env.envs = "3"', "key arms.slow.navigation.env.envs: input should be a valid integer"),
         ("navigation = 3", "key arms.slow.navigation: input should be an object, not 3"),
-        ("evaluation.duration = 60.0", "arms.slow.evaluation: set it in the scale, all arms share it"),
+        ("evaluation.duration = 60.0", "arms.slow.evaluation: set [evaluation] of the scale, all arms share it"),
     ],
 )
 def test_a_wrong_change_names_the_experiment_file(scales: Path, change: str, message: str) -> None:
@@ -183,6 +183,59 @@ def test_all_arms_change_together_at_one_scale(scales: Path) -> None:
     wrong = parse(Experiment, tomllib.loads(text.replace("envs", "envz")), Path("e.toml"))
     with pytest.raises(RomnavError, match=r"unknown key scales\.smoke\.navigation\.env\.envz; did you mean envs"):
         scale.changed("rom", wrong, Path("e.toml"))
+
+
+BODIES = """
+[bodies.g1.navigation]
+env.envs = 9
+env.command.forward = 0.75
+ppo.iterations = 3
+"""
+
+
+def test_an_arm_on_another_body_begins_with_the_settings_of_that_body(scales: Path) -> None:
+    plain = ScaleFile(scales, "smoke")
+    file = scales / "smoke.toml"
+    file.write_text(file.read_text() + BODIES)
+    scale = ScaleFile(scales, "smoke")
+    text = EXPERIMENT.replace("[arms.slow]", '[arms.hum]\nlabel = "H"\nnavigation.dynamics = "g1"\n[arms.slow]')
+    text = text.replace("forward = 0.5", 'forward = 0.5\nnavigation.dynamics = "g1"')
+    experiment = parse(Experiment, tomllib.loads(text), Path("e.toml"))
+    found = {name: scale.changed(name, experiment, Path("e.toml")).navigation for name in experiment.arms}
+    assert found["rom"] == plain.settings.navigation == scale.settings.navigation
+    assert (found["hum"].env.envs, found["hum"].ppo.iterations, found["hum"].env.command.forward) == (9, 3, 0.75)
+    assert found["hum"].env.duration == 20.0  # the scale's
+    assert (found["slow"].env.envs, found["slow"].env.command.forward) == (9, 0.5)  # the arm's own change comes last
+    at_scale = parse(Experiment, tomllib.loads(text + "[scales.smoke.navigation.env]\nenvs = 10\n"), Path("e.toml"))
+    assert scale.changed("hum", at_scale, Path("e.toml")).navigation.env.envs == 10
+
+
+def test_a_scale_of_one_body_has_its_settings(scales: Path) -> None:
+    (scales / "smoke.toml").write_text('navigation.dynamics = "g1"\n' + BODIES)
+    assert ScaleFile(scales, "smoke").settings.navigation.env.envs == 9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("[bodies.g1.navigation.ppo]\niteration = 3", "unknown key bodies.g1.navigation.ppo.iteration; did you mean"),
+        ("[bodies.g1.navigation.env]\nenvs = 0", "key bodies.g1.navigation.env.envs: input should be greater"),
+        ("[bodies.g1.navigation.env]\nenvs = 4", "bodies.g1.navigation: ppo.minibatches: 8 of 4 environments"),
+        ("[bodies.g1.evaluation]\nduration = 9.0", "bodies.g1.evaluation: set [evaluation] of the scale"),
+        ('[bodies.g1.navigation]\ndynamics = "rom"', "bodies.g1.navigation.dynamics: it is g1 here; leave it out"),
+        ("[bodies.g1]\nnavigation = 3", "key bodies.g1.navigation: input should be an object, not 3"),
+        ("[bodies]\ng1 = 3", "key bodies.g1: input should be an object, not 3"),
+        ("[bodies.g2.lidar]\nrows = 3", "bodies.g2"),
+        ("[bodys.g1.lidar]\nrows = 3", "unknown key bodys; did you mean bodies?"),
+    ],
+)
+def test_a_wrong_setting_of_a_body_names_the_scale(scales: Path, change: str, message: str) -> None:
+    file = scales / "smoke.toml"
+    file.write_text(file.read_text() + change)
+    with pytest.raises(RomnavError) as error:
+        ScaleFile(scales, "smoke")
+    assert str(error.value).startswith(f"{file}: {message}")
+    assert "\n" not in str(error.value)
 
 
 def test_an_experiment_names_only_scales_that_there_are(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_trials_are_out_of_date_when_a_scene_has_changed(tmp_path: Path, monkeyp
 def test_arms_share_the_settings_of_trials(tmp_path: Path) -> None:
     here = workspace(tmp_path)
     here.project.file("more").write_text('kind = "safety"\ntitle = "t"\n[arms.own]\nlabel = "Own"\nsafety.trials = 3\n')
-    with pytest.raises(RomnavError, match=r"arms\.own\.safety: set it in the scale"):
+    with pytest.raises(RomnavError, match=r"arms\.own\.safety: set \[safety\] of the scale"):
         trials.trials(here, "safety", "own", 0)
 
 
