@@ -56,7 +56,7 @@ def test_a_gif_shows_every_picture_and_runs_for_ever(tmp_path: Path) -> None:
 def test_other_suffixes_and_a_missing_encoder_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RomnavError, match=r"a video is \.mp4 or \.gif"):
         video.write(tmp_path / "film.avi", pictures())
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr(video, "find_spec", lambda name: None)
     with pytest.raises(RomnavError, match=r"pip install 'romnav\[video\]'"):
         video.write(tmp_path / "film.mp4", pictures())
 
