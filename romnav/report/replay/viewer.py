@@ -33,8 +33,9 @@ ZOOM = 4
 """Screen pixels of an image pixel, at least."""
 FRAME = 1 / 30
 """Time between two pictures of a playing replay, s."""
-UP, BACK = np.array([0.0, 0.0, 1.0]), np.array([-12.0, -12.0, 16.0])
-"""The vertical, and where an episode is looked at from, m."""
+UP = np.array([0.0, 0.0, 1.0])
+BACK, NEAR = np.array([-12.0, -12.0, 16.0]), np.array([-2.0, -2.0, 1.5])
+"""Where an episode and a robot are looked at from, m."""
 NO_TIME = {"x": viser.uplot.Scale(time=False)}
 SPEEDS = ("1", "2", "4", "8", "16")
 
@@ -119,6 +120,7 @@ class Viewer:
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="4")
         self._storeys = gui.add_slider("storeys shown", 1, 4, 1, initial_value=4)
         self._follow = gui.add_checkbox("hide storeys above the robot", initial_value=True)
+        self._chase = gui.add_checkbox("go along with the robot", initial_value=False)
         self._shown = {name: gui.add_checkbox(name, initial_value=True) for name in names}
         with gui.add_folder("what an arm sees"):
             self._eyes = gui.add_dropdown(
@@ -224,6 +226,13 @@ class Viewer:
             if mesh.visible != (storey <= last):
                 mesh.visible = storey <= last
 
+    def _go_along(self) -> None:
+        """Look at the first robot in sight from nearby, if that is asked for."""
+        robots = (body for name, body in self._bodies.items() if self._shown[name].value)
+        if self._chase.value and (robot := next(robots, None)):
+            for client in self.server.get_clients().values():
+                client.camera.position, client.camera.look_at = robot.position + NEAR, robot.position
+
     def _look(self) -> None:
         """Go through the episode again for the arm whose eyes are looked through."""
         name, episode = self._eyes.value, self._episode
@@ -272,6 +281,7 @@ class Viewer:
                     ):
                         mesh.position, mesh.wxyz, mesh.visible = at, turn, self._shown[name].value
             self._cut()
+            self._go_along()
             seen = self._seen.get((self._eyes.value, self._episode))
             for shown in (self._range, self._classes, self._betas, self._along, self._points):
                 shown.visible = False
