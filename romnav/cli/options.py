@@ -124,9 +124,15 @@ class Job(AtScale):
         return "cpu"
 
     def make(
-        self, targets: Sequence[Stage], again: Sequence[Stage] | None = None, *, side_by_side: bool = False
+        self,
+        targets: Sequence[Stage],
+        again: Sequence[Stage] | None = None,
+        *,
+        forced: Sequence[Stage] = (),
+        side_by_side: bool = False,
     ) -> None:
-        """Runs what the targets need; without ``resume``, those in ``again`` start over (default: the targets).
+        """Runs what the targets need, and what is ``forced``; without ``resume``, those in ``again`` start over
+        (default: the targets).
 
         On the CPU, stages that have a command of their own can run ``side_by_side``.
         """
@@ -139,7 +145,7 @@ class Job(AtScale):
             if ranks.rank() > 0:
                 run.follow(targets, session)
                 return
-            repeated = () if self.resume else targets if again is None else again
+            repeated = forced if self.resume else targets if again is None else again
             stages = run.pending(targets, repeated)
             if not stages:
                 _say("nothing to do: everything is finished and up to date")

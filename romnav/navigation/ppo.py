@@ -193,15 +193,19 @@ def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> Nav
     return network(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
+def make_critic(obs: TensorDict, policy: PolicySpec) -> PrivilegedCritic:
+    """Value network for the observations ``obs``."""
+    groups, widths = {"critic": ["critic"]}, list(policy.critic)
+    return PrivilegedCritic(obs, groups, "critic", 1, hidden_dims=widths, obs_normalization=True)
+
+
 def make_ppo(
     obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str, kind: type[P] = BoundedPPO
 ) -> P:
     """Actor, critic, rollout and optimiser, of the ``kind`` of PPO; of one process ``envs`` of several."""
     actor = make_actor(obs, policy, guided=spec.guidance > 0.0).to(device)
     actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
-    critic = PrivilegedCritic(
-        obs, {"critic": ["critic"]}, "critic", 1, hidden_dims=list(policy.critic), obs_normalization=True
-    ).to(device)
+    critic = make_critic(obs, policy).to(device)
     storage = Rollout("rl", envs, spec.steps, obs, [ACTIONS], device)
     options: dict[str, Any] = {
         "num_learning_epochs": spec.epochs,

@@ -16,9 +16,9 @@ from tensordict import TensorDict
 
 from romnav import files, random, ranks, stopping
 from romnav.errors import RomnavError
+from romnav.journal import Journal
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
-from romnav.navigation.journal import Journal
 from romnav.navigation.kickstart import KickstartedPPO, Teacher, blank_lesson
 from romnav.navigation.perception import Perception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
@@ -147,7 +147,7 @@ def _train(
             curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate) | ppo.report())
             _check_finite(state, done, curve[-1], ppo)
             if journal:
-                journal.add(curve[-1])
+                journal.add(done * steps, curve[-1])
                 if spec.ppo.keep and done % spec.ppo.keep == 0:
                     _save_policy(out / "kept" / f"{done:06d}.pt", identity, ppo, done * steps, seconds)
             if progress:
@@ -199,7 +199,8 @@ def _learner(
 
 
 def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:
-    content = {**identity, "actor": ppo.actor.state_dict(), "steps": steps, "hours": seconds / 3600}
+    networks = {"actor": ppo.actor.state_dict(), "critic": ppo.critic.state_dict()}
+    content = {**identity, **networks, "steps": steps, "hours": seconds / 3600}
     if ranks.size() > 1:
         content["processes"] = ranks.size()
     checkpoint.save(path, content)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from romnav import files, stopping
 from romnav.errors import RomnavError
+from romnav.journal import Journal
 from romnav.progress import Progress
 from romnav.robot.locomotion.lane_task import LocomotionEnv
 from romnav.robot.locomotion.task import WalkingEnv
@@ -197,7 +198,7 @@ def train(
     save_every: float = 60.0,
     worlds: Path | None = None,
 ) -> Path:
-    """Train a policy; writes `out/policy.pt`, and `out/curve.csv` with a row per iteration.
+    """Train a policy; writes `out/policy.pt`, and `out/curve.csv` with a row per iteration; TensorBoard's events, too.
 
     Args:
         spec: what to train. When a run is resumed, `spec.iterations` may differ from the checkpoint's.
@@ -248,6 +249,7 @@ def train(
         torch.set_rng_state(saved["torch_random"])
     ppo.train_mode()
     obs = env.get_observations()
+    journal = Journal(out, spec.steps(done) if done else 0)
     begin = mark = time.monotonic()
     with stopping.deferred() as stop:
         for iteration in range(done + 1, spec.iterations + 1):
@@ -283,13 +285,17 @@ def train(
             } | losses  # fmt: skip
             _check_finite(path, iteration, row, ppo)
             curve.append(row)
+            of_losses = {f"loss_{name}": value for name, value in losses.items()}
+            journal.add(row["steps"], {name: row[name] for name in row.keys() - losses.keys()} | of_losses)
             if progress:
                 progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
             if stop or time.monotonic() - mark > save_every or iteration == spec.iterations:
                 mark = time.monotonic()
+                journal.flush()
                 _write_curve(out / "curve.csv", curve)  # first: a resumed run drops what is there too much
                 _save(path, spec, ppo, average, env, iteration, row["seconds"])
             stop.obey()
+    journal.close()
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from romnav.robot.locomotion.train import KIND, load_policy, train
 from romnav.robot.spec import LaterMixSpec, LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
+from tests.test_journal import told
 
 SHARES = {"flat": 0.5, "stairs": 0.5}
 SPEC = LocomotionSpec(
@@ -116,7 +118,12 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
     for key, value in a["ppo"]["actor_state_dict"].items():
         assert torch.equal(value, b["ppo"]["actor_state_dict"][key]), key
     assert np.array_equal(a["env"]["robots"]["qpos"], b["env"]["robots"]["qpos"])
-    assert len((tmp_path / "parts" / "curve.csv").read_text().splitlines()) == 3
+    with (tmp_path / "parts" / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    seen = told(tmp_path / "parts")
+    for tag, column in {"run/reward": "reward", "loss/value": "value", "run/fell": "fell"}.items():
+        assert seen[tag] == [(int(row["steps"]), pytest.approx(float(row[column]), rel=1e-4)) for row in rows]
+    assert len(rows) == 2
     spec, policy, iteration = load_policy(parts)
     assert spec == SPEC
     assert iteration == 2
