@@ -89,6 +89,13 @@ def _read_curve(path: Path) -> Any:
     return pd.read_csv(path).to_csv()
 
 
+def _make_record(target: Path) -> None:
+    """One with a checksum, as records are written."""
+    data = json.loads((RESULTS / "smoke/rom/seed-0/spec.json").read_text())
+    data.pop(records.SUM, None)
+    target.write_text(json.dumps({**data, records.SUM: records.checksum(data)}, indent=2) + "\n")
+
+
 def _read_record(path: Path) -> Any:
     return records.read(Stage("policy", "policy", path.parent, (), path, WORLD, (), lambda *told: {}))
 
@@ -121,7 +128,7 @@ FILES = {
     "rows of trials": File(_anew(trial_rows, RESULTS / "smoke/rom/seed-0/safety.parquet"), trial_rows.read),
     "tracks": File(_make_tracks, tracks.read),
     "learning curve": File(_copy(CURVE), _read_curve),
-    "record": File(_copy(RESULTS / "smoke/rom/seed-0/spec.json"), _read_record),
+    "record": File(_make_record, _read_record),
     "experiment": File(_copy(ROOT / "experiments/spawn-goal.toml"), _read_experiment, by_hand=True),
     "scale": File(_copy(ROOT / "experiments/scales/cpu.toml"), _read_scale, by_hand=True),
 }

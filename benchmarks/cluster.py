@@ -109,7 +109,7 @@ def main() -> None:
     wanted = [stage for name in given.experiments for stage in reports(work, name, range(given.seeds))]
     stages = with_all_above(wanted)
     order = {stage.name: stage for stage in stages}
-    stages = _upstream_first(list(order.values()))
+    stages = upstream_first(list(order.values()))
     lasts = {stage.name: seconds(stage, Rates(given.rom, given.g1)) for stage in stages}
     lines = [
         f"Simulated: {', '.join(given.experiments)} at scale {given.scale}, {given.seeds} seeds, {len(stages)} stages. "
@@ -129,7 +129,8 @@ def main() -> None:
     print(text)
 
 
-def _upstream_first(stages: Sequence[Stage]) -> list[Stage]:
+def upstream_first(stages: Sequence[Stage]) -> list[Stage]:
+    """The stages in an order in which they can be made."""
     known = {stage.name: stage for stage in stages}
     ordered: dict[str, Stage] = {}
 

@@ -34,7 +34,7 @@ PARTS = {
     "physics": ("step", "mujoco._batch"),
     "surroundings": ("_surround", "g1.py"),
     "reference gait, with": ("update", "lip.py"),
-    "heights of the ground": ("__call__", "tiles.py"),
+    "heights of the ground": ("__call__", "heights.py"),
     "inverse kinematics": ("inverse", "legs.py"),
     "observation": ("observe", "control.py"),
     "policy": ("policy", "train.py"),
@@ -60,7 +60,7 @@ class Walk:
         draws = torch.stack([uniform(0, ids, zero, _COMMAND, k) for k in range(3)], dim=1)
         self.command = torch.tensor([0.0, -0.25, -1.0]) + draws * torch.tensor([1.0, 0.5, 2.0])
         self.start = self.body.state_dict()
-        self.told: list[np.ndarray] = []
+        self.told: list[tuple[np.ndarray, np.ndarray | None]] = []
         self.end = self._record()
 
     def _record(self) -> np.ndarray:
@@ -68,7 +68,7 @@ class Walk:
         step = self.body.robots.step
 
         def recorded(target: torch.Tensor, ids: torch.Tensor | None = None) -> None:
-            self.told.append(target.double().numpy().copy())
+            self.told.append((target.double().numpy().copy(), None if ids is None else ids.numpy().copy()))
             step(target, ids)
 
         self.body.robots.step = recorded  # type: ignore[method-assign]
@@ -85,10 +85,10 @@ class Walk:
         """The physics of `ours`, in the same models."""
         batch = self.body.robots.batch
         self.body.load_state_dict(self.start)
-        for target in self.told:
+        for target, standing in self.told:
             batch.ctrl[:] = target
             self.body.robots._surround(batch.qpos[:, :3])
-            batch.step(nstep=RobotSpec().decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
+            batch.step(ids=standing, nstep=RobotSpec().decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class Whole:
@@ -111,7 +111,7 @@ class Whole:
             for name, value in start.items():
                 getattr(batch, name)[:] = value
             batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
-            for target in self.walk.told:
+            for target, _ in self.walk.told:
                 batch.ctrl[:] = target[ids]
                 batch.step(nstep=RobotSpec().decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
 

@@ -6,8 +6,9 @@ A quoted number stands between two comments, of which the first tells where it c
     <!-- = results/cpu/locomotion/terrain.json terrain=ramp/crossed 100*.3g -->100<!-- -->
     <!-- = results/smoke/tables/safety.csv "In-Distribution, CBF" collision .3g -->0<!-- -->
 
-A key of JSON leads through objects by name and through lists by a field that has a value; a row and a column lead to
-our first number in a table's CSV. The last word formats the number, times 100 if it begins so. A whole table is
+A key of JSON leads through objects by name and through lists by a field that has a value or by position; several keys
+are added up. A row and a column lead to our first number in a table's CSV. The last word formats the number, times a
+factor if it begins so. A whole table is
 
     <!-- = results/smoke/tables/safety.md -->
     <!-- -->
@@ -53,17 +54,24 @@ def value(source: str) -> str:
             return f"\n\n{path.read_text('utf-8').strip()}\n\n"
         *keys, form = keys
         number = {".json": _of_json, ".csv": _of_csv}[path.suffix](path, *keys)
-        factor, form = (100, form.removeprefix("100*")) if form.startswith("100*") else (1, form)
-        return f"{factor * number:{form}}"
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        factor, _, form = form.rpartition("*")
+        return f"{number * float(factor or 1):{form}}"
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
         raise SourceError(f"{source}: {error}") from error
 
 
-def _of_json(path: Path, keys: str) -> float:
-    found: Any = json.loads(path.read_text("utf-8"))
+def _of_json(path: Path, *keys: str) -> float:
+    content = json.loads(path.read_text("utf-8"))
+    return sum([_at(content, key) for key in keys])
+
+
+def _at(found: Any, keys: str) -> float:
     for key in keys.split("/"):
         name, _, wanted = key.partition("=")
-        found = next(item for item in found if str(item[name]) == wanted) if wanted else found[name]
+        if wanted:
+            (found,) = [item for item in found if str(item[name]) == wanted]
+        else:
+            found = found[int(name)] if isinstance(found, list) else found[name]
     return float(found)
 
 

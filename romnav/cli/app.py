@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from romnav import __version__, stopping
+from romnav import __version__, ranks, stopping
 from romnav.cli.options import AtScale, ResultsOption, ScaleOption
 from romnav.errors import RomnavError
 
@@ -29,9 +29,15 @@ class _Program(TyperGroup):
             raise typer.Exit(1) from None
         except KeyboardInterrupt as stopped:
             number = stopped.number if isinstance(stopped, stopping.Stopped) else signal.SIGINT
-            again = shlex.join(["romnav", *(word for word in sys.argv[1:] if word != "--no-resume")])
+            again = shlex.join([*_program(), *(word for word in sys.argv[1:] if word != "--no-resume")])
             typer.echo(f"\nstopped; what is done is kept, go on with: {again}", err=True)
             raise typer.Exit(128 + number) from None
+
+
+def _program() -> list[str]:
+    """Words that start this program as it was started."""
+    processes = ranks.started()
+    return ["romnav"] if processes == 1 else ["torchrun", "--nproc-per-node", str(processes), "-m", "romnav.cli"]
 
 
 app = typer.Typer(

@@ -96,6 +96,9 @@ def evaluate(
     along: Annotated[
         bool, typer.Option("--kept", help="Judge what an arm's run has kept on the way, on the episodes for choices.")
     ] = False,
+    joints: Annotated[
+        bool, typer.Option("--joints", help="Keep the humanoid's joints beside its tracks, for the viewer and films.")
+    ] = False,
     seed: SeedOption = None,
     navigation: Annotated[
         bool,
@@ -104,12 +107,15 @@ def evaluate(
 ) -> None:
     """Evaluate arms on the episode set that all arms share, or the locomotion policy on its tests."""
     from romnav.experiment.graph.run import require
+    from romnav.experiment.kinds.episodes import POSTURES
 
     names, paired = names or [], paired or all_pairs or verbose
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise RomnavError(f"{twice} is named twice; name each arm once")
     if not names and (along or not paired):
         raise RomnavError("name arms, or compare all that are trained by `romnav eval --paired`; see `romnav list`")
+    if joints and (along or not names):
+        raise RomnavError("--joints: are those of evaluated arms; name arms on the humanoid, without --kept")
     if along:
         _judge_kept(job, names, seed)
         return
@@ -122,22 +128,23 @@ def evaluate(
             return
     if paired and len(names) == 1:
         raise RomnavError(f"--paired compares arms: name one beside {names[0]}, or none for all that are trained")
-    stages = _of_arms(job, names, seed) if names else _of_trained_arms(job, seed)
+    stages = _of_arms(job, names, seed, joints) if names else _of_trained_arms(job, seed)
     for stage in stages:
         driver = job.project.driver(str(stage.arm))
         for policy in (above for above in stage.upstream if (above.kind, above.arm) == ("policy", driver)):
             require(policy, stage)
-    job.make(stages)
+    job.make(stages, forced=[stage for stage in stages if joints and not (stage.folder / POSTURES).exists()])
     collected = _collect(job, {str(stage.arm) for stage in stages})
     chosen = names or [run["arm"] for run in collected["arms"]]
     pairs = [(names[0], other) for other in names[1:]] if names else job.project.comparisons(chosen)
     _print_results(collected, chosen, _pairs(chosen, pairs, all_pairs) if paired else [], verbose)
 
 
-def _of_arms(job: DeviceJob, names: list[str], seed: int | None) -> list[Stage]:
+def _of_arms(job: DeviceJob, names: list[str], seed: int | None, joints: bool) -> list[Stage]:
     from romnav.experiment.kinds.episodes import episodes
 
-    return [episodes(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+    seeds = {name: job.project.seeds(name) if seed is None else (seed,) for name in names}
+    return [episodes(job.work, name, s, joints=joints) for name in names for s in seeds[name]]
 
 
 def _of_trained_arms(job: DeviceJob, seed: int | None) -> list[Stage]:

@@ -8,13 +8,14 @@ import inspect
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
+from romnav import ranks
 from romnav.errors import RomnavError
 
 if TYPE_CHECKING:
@@ -123,24 +124,36 @@ class Job(AtScale):
         return "cpu"
 
     def make(
-        self, targets: Sequence[Stage], again: Sequence[Stage] | None = None, *, side_by_side: bool = False
+        self,
+        targets: Sequence[Stage],
+        again: Sequence[Stage] | None = None,
+        *,
+        forced: Sequence[Stage] = (),
+        side_by_side: bool = False,
     ) -> None:
-        """Runs what the targets need; without ``resume``, those in ``again`` start over (default: the targets).
+        """Runs what the targets need, and what is ``forced``; without ``resume``, those in ``again`` start over
+        (default: the targets).
 
         On the CPU, stages that have a command of their own can run ``side_by_side``.
         """
         from romnav.experiment.graph import launch, run
 
-        session = self._session()
-        repeated = () if self.resume else targets if again is None else again
-        stages = run.pending(targets, repeated)
-        if not stages:
-            _say("nothing to do: everything is finished and up to date")
-        run.prepare(stages)
-        execute = self._engine()
-        if not execute:
-            execute = launch.execute_side_by_side if side_by_side and self.device == "cpu" else run.execute
-        execute(stages, session, _say)
+        if ranks.started() > 1 and not all(stage.shared for stage in targets):
+            raise RomnavError("several processes (WORLD_SIZE) train a policy alone; start this without torchrun")
+        with ranks.joined(self.device) as device:
+            session = replace(self._session(), device=device)
+            if ranks.rank() > 0:
+                run.follow(targets, session)
+                return
+            repeated = forced if self.resume else targets if again is None else again
+            stages = run.pending(targets, repeated)
+            if not stages:
+                _say("nothing to do: everything is finished and up to date")
+            run.prepare(stages)
+            execute = self._engine()
+            if not execute:
+                execute = launch.execute_side_by_side if side_by_side and self.device == "cpu" else run.execute
+            execute(stages, session, _say)
 
     def _engine(self) -> Callable[[Iterable[Stage], Session, Callable[[str], None]], None] | None:
         """What runs stages elsewhere, if it is not this machine."""

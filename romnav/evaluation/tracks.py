@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav import files
 from romnav.errors import RomnavError
+from romnav.robot.dynamics import Dynamics
 
 if TYPE_CHECKING:
     from romnav.evaluation.rollout import View
@@ -53,22 +55,23 @@ class Recorder:
 
     def add(self, view: View, alive: Tensor) -> None:
         """Keep the present sample of the rows ``alive`` (A,)."""
-        robot = view.robot
-        columns = [*robot.position.T, robot.yaw, robot.contacts > 0]
-        sample = np.stack([column[alive].cpu().numpy().astype(np.float64) for column in columns], axis=1)
-        self._parts.append((view.episode[alive].cpu().numpy(), sample))
+        sample = torch.cat([column[alive].double() for column in self._columns(view.robot)], dim=1)
+        self._parts.append((view.episode[alive].cpu().numpy(), sample.cpu().numpy()))
+
+    def _columns(self, robot: Dynamics) -> list[Tensor]:
+        """What is kept of the robots (A, ...)."""
+        return [robot.position, robot.yaw[:, None], robot.contacts[:, None] > 0]
 
     def tracks(self, episodes: int) -> Tracks:
         """What was collected, episode by episode."""
+        first, samples = self._sorted(episodes)
+        return Tracks(first, _rounded(samples[:, :3]), _rounded(samples[:, 3]), samples[:, 4] > 0)
+
+    def _sorted(self, episodes: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """First sample (n + 1,) of each episode, and the samples (N, C)."""
         episode, samples = (np.concatenate(column) for column in zip(*self._parts, strict=True))
-        order = np.argsort(episode, kind="stable")
-        samples = samples[order]
-        return Tracks(
-            first=np.concatenate([[0], np.cumsum(np.bincount(episode, minlength=episodes))]),
-            position=_rounded(samples[:, :3]),
-            yaw=_rounded(samples[:, 3]),
-            contact=samples[:, 4] > 0,
-        )
+        first = np.concatenate([[0], np.cumsum(np.bincount(episode, minlength=episodes))])
+        return first, samples[np.argsort(episode, kind="stable")]
 
 
 def _rounded(values: NDArray) -> NDArray[np.float32]:

@@ -64,7 +64,7 @@ class Scale(Config):
     """Share of a machine that a stage takes on a cluster."""
     bodies: dict[Annotated[str, BODIES], dict[str, Any]] = Field(default={})
     """Settings that differ where another body is trained, e.g. ``bodies.g1.navigation.env.envs = 96``. They come before
-    those of the arm."""
+    those of the arm; those of ``kickstart`` are for arms that have a teacher."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -107,7 +107,8 @@ class ScaleFile:
         for body, change in self._bodies.items():
             key = f"bodies.{body}"
             _refuse_shared(file, key, change)
-            driven = _merge(self._data, {"navigation": {"dynamics": body}})
+            taught = {"kickstart": {"teacher": "any"}} if "kickstart" in change else {}
+            driven = _merge(self._data, {"navigation": {"dynamics": body}} | taught)
             if parse(Scale, _merge(driven, change), file, f"{key}.").navigation.dynamics != body:
                 raise RomnavError(f"{file}: {key}.navigation.dynamics: it is {body} here; leave it out")
         self.settings = parse(Scale, self._on_its_body(), file)
@@ -119,19 +120,24 @@ class ScaleFile:
             RomnavError: The arm, or the experiment at this scale, changes a setting that does not exist, or to a value
                 of a wrong type.
         """
-        shared, own = experiment.scales.get(self.name, {}), experiment.arms[name].changes
-        data = self._on_its_body(shared, own)
-        for key, change in ((f"scales.{self.name}", shared), (f"arms.{name}", own)):
+        changes = {
+            f"scales.{self.name}": experiment.scales.get(self.name, {}),
+            f"arms.{name}": experiment.arms[name].changes,
+        }
+        applied: list[Mapping[str, Any]] = []
+        for key, change in changes.items():
             _refuse_shared(file, key, change)
-            data = _merge(data, change)
-            settings = parse(Scale, data, file, f"{key}.")
+            applied.append(change)
+            settings = parse(Scale, reduce(_merge, applied, self._on_its_body(*applied)), file, f"{key}.")
         return settings
 
     def _on_its_body(self, *changes: Mapping[str, Any]) -> dict[str, Any]:
         """The scale for the body that it has after some changes, without these."""
-        navigation = reduce(_merge, changes, self._data).get("navigation")
+        whole = reduce(_merge, changes, self._data)
+        navigation = whole.get("navigation")
         body = navigation.get("dynamics", "rom") if isinstance(navigation, dict) else None
-        return _merge(self._data, self._bodies.get(str(body), {}))
+        own = self._bodies.get(str(body), {})
+        return _merge(self._data, {name: own[name] for name in own if name != "kickstart" or name in whole})
 
 
 def _refuse_shared(file: Path, key: str, change: Mapping[str, Any]) -> None:

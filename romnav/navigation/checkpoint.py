@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from romnav import parts
 from romnav.errors import RomnavError
 from romnav.navigation.policy import BEARING, NavigationActor
-from romnav.navigation.ppo import make_actor
+from romnav.navigation.ppo import PrivilegedCritic, make_actor, make_critic
 from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.encoder import Encoder
 from romnav.tensors import Kind, require_finite
@@ -20,6 +20,27 @@ from romnav.tensors import Kind, require_finite
 KIND = Kind("romnav-policy-1", "policy", "train the arm by `romnav train policy`")
 """Policies, and the states of unfinished runs."""
 save, read = KIND.save, KIND.load
+
+
+def load_critic(path: Path) -> PrivilegedCritic | None:
+    """The critic that the policy of ``path`` was trained with, in evaluation mode; None if it is not in the file.
+
+    Raises:
+        RomnavError: As `read`; its weights are not finite or of another shape.
+    """
+    content = read(path)
+    if "critic" not in content:
+        return None
+    again, weights = "train the arm again", content["critic"]
+    try:
+        spec = NavigationSpec.model_validate_json(content["spec"], context=parts.SAVED)
+        seen = torch.zeros(1, weights["mlp.0.weight"].shape[1])
+        critic = make_critic(TensorDict({"critic": seen}, batch_size=[1]), spec.policy)
+        critic.load_state_dict(weights)
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise RomnavError(f"{path}: key 'critic' is of another architecture; {again}") from error
+    require_finite(path, weights, again)
+    return critic.eval()
 
 
 def load_actor(

@@ -11,7 +11,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from romnav import random
+from romnav import random, ranks
 from romnav.navigation.observations import ACTIONS, Perceive, PrivilegedObservation, observe, wrap
 from romnav.navigation.rewards import Transition, terms, weights
 from romnav.navigation.spec import CommandSpec, EnvSpec
@@ -51,8 +51,27 @@ class NavigationEnv(VecEnv):
     """
 
     def __init__(
-        self, world: World, dynamics: Dynamics, perceive: Perceive, spec: EnvSpec, seed: int, device: str
+        self,
+        world: World,
+        dynamics: Dynamics,
+        perceive: Perceive,
+        spec: EnvSpec,
+        seed: int,
+        device: str,
+        numbers: range | None = None,
     ) -> None:
+        """
+        Args:
+            world: Terrain.
+            dynamics: The robots, one for each environment.
+            perceive: Their sensors.
+            spec: The task.
+            seed: Of everything that is drawn.
+            device: Torch device.
+            numbers: Of the environments, which their draws depend on, where others are elsewhere; default: all of the
+                spec.
+        """
+        numbers = numbers or range(spec.envs)
         self.world = world
         self.dynamics = dynamics
         self.perceive = perceive
@@ -60,7 +79,7 @@ class NavigationEnv(VecEnv):
         self.cfg = spec.model_dump()
         self.seed = seed
         self.device = device
-        self.num_envs = spec.envs
+        self.num_envs = count = len(numbers)
         self.num_actions = ACTIONS
         self.max_episode_length = round(spec.duration / spec.period)
         self.progress = 0.0
@@ -68,27 +87,26 @@ class NavigationEnv(VecEnv):
         self._lookup = GeodesicLookup(world)
         self._privileged = PrivilegedObservation(world)
         self._connector = torch.from_numpy(np.concatenate([grid.connector for grid in world.grids])).to(device)
-        count = spec.envs
-        self._env = torch.arange(count, device=device)
-        self._episode = torch.zeros_like(self._env)
+        self._number = torch.arange(numbers.start, numbers.stop, device=device)
+        self._episode = torch.zeros_like(self._number)
         self._step = 0
-        self.episode_length_buf = torch.zeros_like(self._env)
-        self._goal = torch.zeros_like(self._env)
+        self.episode_length_buf = torch.zeros_like(self._number)
+        self._goal = torch.zeros_like(self._number)
         self._goal_position = torch.zeros(count, 3, device=device)
         self._goal_yaw = torch.zeros(count, device=device)
         self._command = torch.zeros(count, ACTIONS, device=device)
         self._best = torch.zeros(count, 2, device=device)
-        self._since_arrival = torch.full_like(self._env, -1)
-        self._since_best = torch.zeros_like(self._env)
+        self._since_arrival = torch.full_like(self._number, -1)
+        self._since_best = torch.zeros_like(self._number)
         self._cross = torch.zeros(count, dtype=torch.bool, device=device)
         self._geodesic = torch.zeros(count, device=device)
         self._direction = torch.zeros(count, 2, device=device)
         self._finished = torch.zeros(4, dtype=torch.float64, device=device)
         self._reward_sums = torch.zeros(len(weights(spec.reward, 0.0)), dtype=torch.float64, device=device)
         self._reward_steps = 0
-        self.restart(self._env)
+        self.restart(torch.arange(count, device=device))
         # spread over the episode: environments that all end at once make every rollout a different task
-        spread = random.uniform(seed, self._env, 0xA6E)
+        spread = random.uniform(seed, self._number, 0xA6E)
         self.episode_length_buf = (spread * self.max_episode_length).long()
 
     def state_dict(self) -> dict[str, Any]:
@@ -130,7 +148,7 @@ class NavigationEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """Observations of the present state."""
         d = self.dynamics
-        counters = torch.stack([self._env, torch.full_like(self._env, self._step)], dim=1)
+        counters = torch.stack([self._number, torch.full_like(self._number, self._step)], dim=1)
         d_max = self.spec.max_goal_distance
         seen = observe(d, self._goal_position, self._goal_yaw, self._command, counters, self.perceive, d_max)
         remaining = 1.0 - self.episode_length_buf / self.max_episode_length
@@ -189,9 +207,9 @@ class NavigationEnv(VecEnv):
         return reward, fallen, timeout
 
     def statistics(self) -> Statistics:
-        """Statistics of the episodes that finished since the last call."""
-        same, same_success, cross, cross_success = self._finished.tolist()
-        rewards = (self._reward_sums / max(self._reward_steps, 1)).tolist()
+        """Statistics of the episodes that finished since the last call, of all processes."""
+        same, same_success, cross, cross_success = ranks.total(self._finished).tolist()
+        rewards = (ranks.total(self._reward_sums) / max(ranks.size() * self._reward_steps, 1)).tolist()
         self._finished = torch.zeros_like(self._finished)
         self._reward_sums = torch.zeros_like(self._reward_sums)
         self._reward_steps = 0
@@ -250,9 +268,9 @@ class NavigationEnv(VecEnv):
         """Put the robots ``envs`` (K,) at the starts of their next episodes."""
         if len(envs) == 0:
             return
-        episode = self._episode[envs]
-        tile = random.integers(len(self.world.tiles), self.seed, envs, episode, 0x711E)
-        self._start(envs, sample(self.world, self.spec.sampler, self.seed, tile, envs, episode))
+        number, episode = self._number[envs], self._episode[envs]
+        tile = random.integers(len(self.world.tiles), self.seed, number, episode, 0x711E)
+        self._start(envs, sample(self.world, self.spec.sampler, self.seed, tile, number, episode))
         self._episode[envs] += 1
 
     def _start(self, envs: Tensor, start: Start) -> None:

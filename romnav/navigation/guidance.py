@@ -9,6 +9,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from torch import Tensor
 
+from romnav import ranks
 from romnav.navigation.observations import privileged_way
 from romnav.navigation.policy import NavigationActor
 
@@ -32,4 +33,5 @@ class Guidance:
         guess = cast(NavigationActor, actor).guess
         far = (log_geodesic > torch.tensor(FAR).log()).to(guess.dtype)
         wrong = (guess[..., :2] - direction).square().sum(dim=-1) + 0.25 * (guess[..., 2] - log_geodesic).square()
-        return (wrong * far).sum() / far.sum().clamp(min=1.0)
+        # processes average their gradients, but may not have equally many guesses that count
+        return ranks.size() * (wrong * far).sum() / ranks.total(far.sum()).clamp(min=1.0)

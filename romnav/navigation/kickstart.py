@@ -18,6 +18,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
+from romnav import ranks
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint
 from romnav.navigation.observations import ACTIONS
@@ -180,7 +181,7 @@ class Divergence:
 
     def by_place(self) -> dict[str, float]:
         """Means on the spawn's level and at `PLACES` since they were last asked for, NaN where nobody was."""
-        total, count = self._sums
+        total, count = ranks.total(self._sums)
         means = (total / count).tolist()  # 0 / 0 is NaN
         self._forget()
         return dict(zip([f"divergence_{place}" for place in ("same", *PLACES)], means, strict=True))

@@ -15,6 +15,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
+from romnav import ranks
 from romnav.navigation.guidance import Guidance
 from romnav.navigation.observations import ACTIONS
 from romnav.navigation.policy import LAYERS, NavigationActor
@@ -137,11 +138,17 @@ class BoundedPPO(PPO):
         low, high = self.learning_rate_range
         self._learning_rate = min(max(value, low), high)
 
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Returns and advantages of the rollout; those are normalised over the environments of all processes."""
+        super().compute_returns(obs)
+        if ranks.size() > 1:  # rsl-rl has normalised the share of each by itself
+            self.storage.advantages = _normalised(self.storage.returns - self.storage.values)
+
     def update(self) -> dict[str, float]:
         """One update; its mean losses by name."""
         losses: dict[str, float] = super().update()
         losses.pop("symmetry", None)
-        return losses | self.symmetry.means()
+        return ranks.means(losses | self.symmetry.means())
 
     def begin(self, share: float) -> None:
         """Set everything that is scheduled once ``share`` of the run is done."""
@@ -168,6 +175,15 @@ class BoundedPPO(PPO):
         )
 
 
+def _normalised(values: Tensor) -> Tensor:
+    """Values less their mean, over their standard deviation, both of all processes."""
+    wide = values.double()
+    count = ranks.size() * values.numel()
+    centred = wide - ranks.total(wide.sum()) / count
+    deviation = (ranks.total(centred.square().sum()) / (count - 1)).sqrt()
+    return (centred / (deviation + 1e-8)).to(values.dtype)
+
+
 P = TypeVar("P", bound=BoundedPPO)
 
 
@@ -177,15 +193,19 @@ def make_actor(obs: TensorDict, policy: PolicySpec, guided: bool = False) -> Nav
     return network(obs, {"actor": ["state"]}, "actor", ACTIONS, policy, guided)
 
 
+def make_critic(obs: TensorDict, policy: PolicySpec) -> PrivilegedCritic:
+    """Value network for the observations ``obs``."""
+    groups, widths = {"critic": ["critic"]}, list(policy.critic)
+    return PrivilegedCritic(obs, groups, "critic", 1, hidden_dims=widths, obs_normalization=True)
+
+
 def make_ppo(
     obs: TensorDict, policy: PolicySpec, spec: PPOSpec, envs: int, device: str, kind: type[P] = BoundedPPO
 ) -> P:
-    """Actor, critic, rollout and optimiser, of the ``kind`` of PPO."""
+    """Actor, critic, rollout and optimiser, of the ``kind`` of PPO; of one process ``envs`` of several."""
     actor = make_actor(obs, policy, guided=spec.guidance > 0.0).to(device)
     actor.reset(hidden_state=torch.zeros(LAYERS, envs, policy.recurrent, device=device))
-    critic = PrivilegedCritic(
-        obs, {"critic": ["critic"]}, "critic", 1, hidden_dims=list(policy.critic), obs_normalization=True
-    ).to(device)
+    critic = make_critic(obs, policy).to(device)
     storage = Rollout("rl", envs, spec.steps, obs, [ACTIONS], device)
     options: dict[str, Any] = {
         "num_learning_epochs": spec.epochs,
@@ -200,6 +220,8 @@ def make_ppo(
         "desired_kl": spec.desired_kl,
         "learning_rate": spec.learning_rate,
     }
+    if ranks.size() > 1:
+        options["multi_gpu_cfg"] = {"global_rank": ranks.rank(), "world_size": ranks.size()}
     ppo = kind(actor, critic, storage, device=device, **options)
     # one pass over all parameters instead of ten per tensor
     ppo.optimizer = torch.optim.Adam(chain(actor.parameters(), critic.parameters()), spec.learning_rate, fused=True)

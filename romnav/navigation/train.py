@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,11 +14,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from romnav import files, stopping
+from romnav import files, random, ranks, stopping
 from romnav.errors import RomnavError
+from romnav.journal import Journal
 from romnav.navigation import checkpoint
 from romnav.navigation.env import NavigationEnv
-from romnav.navigation.journal import Journal
 from romnav.navigation.kickstart import KickstartedPPO, Teacher, blank_lesson
 from romnav.navigation.perception import Perception
 from romnav.navigation.ppo import BoundedPPO, make_ppo
@@ -55,6 +56,9 @@ def train(
     ends in the same weights as one left alone. A signal that ends the program has it written, too, after the iteration
     at hand.
 
+    Processes of one group (`ranks`) train one policy: each has its share of the environments, they average their
+    gradients, and rank 0 writes. As many of them can resume the run.
+
     Args:
         spec: Task, policy and learning.
         world: Terrain.
@@ -69,7 +73,7 @@ def train(
 
     Raises:
         RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written; the teacher does not
-            fit.
+            fit; the environments cannot be shared by the processes.
     """
     with torch_threads(spec.ppo.threads):
         return _train(spec, world, perception, out, seed, body, kickstart, device, resume, progress)
@@ -87,13 +91,16 @@ def _train(
     resume: bool,
     progress: Progress | None,
 ) -> Path:
-    torch.manual_seed(seed)
+    numbers = _share(spec)
+    torch.manual_seed(seed if ranks.rank() == 0 else int(random.bits(seed, ranks.rank())))
     world = world.to(device)
-    dynamics = body(world, spec.env.envs, spec.env.period)
+    dynamics = body(world, len(numbers), spec.env.period)
     perception.images = False
-    env = NavigationEnv(world, dynamics, perception, spec.env, seed, device)
+    env = NavigationEnv(world, dynamics, perception, spec.env, seed, device, numbers)
     obs = env.get_observations()
     ppo = _learner(spec, env, obs, perception, kickstart, device)
+    if ranks.size() > 1:
+        ppo.broadcast_parameters()
     identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
     if perception.depth is not None:
         identity["depth_encoder"] = perception.depth.encoder.digest()
@@ -111,7 +118,7 @@ def _train(
         done, seconds, curve = saved["iterations"], saved["seconds"], saved["curve"]
         obs = env.get_observations()
     ppo.train_mode()
-    journal = Journal(out, done * spec.env.envs * spec.ppo.steps)
+    journal = Journal(out, done * spec.env.envs * spec.ppo.steps) if ranks.rank() == 0 else None
     saved_at = started = time.monotonic()
     before, cpu_before = seconds, curve[-1]["cpu_seconds"] if curve else 0.0
     cpu_started = time.process_time()
@@ -135,24 +142,42 @@ def _train(
                 raise error
             done += 1
             seconds = before + time.monotonic() - started
-            cpu_seconds = cpu_before + time.process_time() - cpu_started
+            cpu_spent = torch.tensor(time.process_time() - cpu_started, dtype=torch.float64)
+            cpu_seconds = cpu_before + float(ranks.total(cpu_spent))
             curve.append(_row(done, done * steps, seconds, cpu_seconds, env, losses, ppo.learning_rate) | ppo.report())
             _check_finite(state, done, curve[-1], ppo)
-            journal.add(curve[-1])
+            if journal:
+                journal.add(done * steps, curve[-1])
+                if spec.ppo.keep and done % spec.ppo.keep == 0:
+                    _save_policy(out / "kept" / f"{done:06d}.pt", identity, ppo, done * steps, seconds)
             if progress:
                 progress(done * steps, total * steps, _summary(curve))
-            if spec.ppo.keep and done % spec.ppo.keep == 0:
-                _save_policy(out / "kept" / f"{done:06d}.pt", identity, ppo, done * steps, seconds)
-            if stop or (time.monotonic() - saved_at > SAVE_EVERY and done < total):
-                journal.flush()
+            stopped, due = ranks.anywhere(bool(stop), time.monotonic() - saved_at > SAVE_EVERY and done < total)
+            if stopped or due:
+                if journal:
+                    journal.flush()
                 _save(state, identity, ppo, env, done, seconds, curve)
                 saved_at = time.monotonic()
+            if stopped and not stop:
+                stop.note(signal.SIGTERM)  # another process was asked to end
             stop.obey()
-    journal.close()
-    _write_curve(out / "curve.csv", curve)
     policy = out / "policy.pt"
-    _save_policy(policy, identity, ppo, total * steps, seconds)
+    if journal:
+        journal.close()
+        _write_curve(out / "curve.csv", curve)
+        _save_policy(policy, identity, ppo, total * steps, seconds)
     return policy
+
+
+def _share(spec: NavigationSpec) -> range:
+    """Numbers of the environments of this process."""
+    processes, envs = ranks.size(), spec.env.envs
+    if envs % processes or envs // processes < spec.ppo.minibatches:
+        raise RomnavError(
+            f"navigation.env.envs: {envs} in {spec.ppo.minibatches} minibatches (ppo.minibatches) cannot be shared by "
+            f"{processes} processes; start as many that each has equally many, one for every minibatch at least"
+        )
+    return ranks.share(envs)
 
 
 def _learner(
@@ -174,20 +199,30 @@ def _learner(
 
 
 def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:
-    content = {**identity, "actor": ppo.actor.state_dict(), "steps": steps, "hours": seconds / 3600}
+    networks = {"actor": ppo.actor.state_dict(), "critic": ppo.critic.state_dict()}
+    content = {**identity, **networks, "steps": steps, "hours": seconds / 3600}
+    if ranks.size() > 1:
+        content["processes"] = ranks.size()
     checkpoint.save(path, content)
 
 
 def _save(
     path: Path, identity: dict[str, Any], ppo: Any, env: NavigationEnv, done: int, seconds: float, curve: list
 ) -> None:
-    content = {
-        **identity,
-        **ppo.save(),
+    share = {
         **ppo.memories(),
         "env": env.state_dict(),
         "random": torch.get_rng_state(),
         **({"device_random": torch.cuda.get_rng_state(env.device)} if env.device != "cpu" else {}),
+    }
+    shares = ranks.gathered(share)
+    if not shares:
+        return
+    content = {
+        **identity,
+        **ppo.save(),
+        **shares[0],
+        "others": shares[1:],
         "iterations": done,
         "seconds": seconds,
         "curve": curve,
@@ -212,12 +247,19 @@ def _restore(
             raise RomnavError(
                 f"{path}: belongs to a run with another {key}; delete it, or pass --no-resume to start over"
             )
+    shares = [content, *content.get("others", [])]
+    if len(shares) != ranks.size():
+        raise RomnavError(
+            f"{path}: belongs to a run of {len(shares)} processes, and here are {ranks.size()}; start as many, or pass "
+            "--no-resume to start over"
+        )
+    share = shares[ranks.rank()]
     ppo.load(content, None, True)
-    ppo.remember(content)
-    env.load_state_dict(content["env"])
-    torch.set_rng_state(content["random"].cpu())
-    if "device_random" in content:
-        torch.cuda.set_rng_state(content["device_random"].cpu(), env.device)
+    ppo.remember(share)
+    env.load_state_dict(share["env"])
+    torch.set_rng_state(share["random"].cpu())
+    if "device_random" in share:
+        torch.cuda.set_rng_state(share["device_random"].cpu(), env.device)
 
 
 def _row(

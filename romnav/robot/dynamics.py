@@ -51,6 +51,11 @@ class Dynamics(Protocol):
         """Where its sensors are; None for a body whose head never sways."""
         ...
 
+    @property
+    def joints(self) -> Tensor | None:
+        """(E, Q) float64 generalised positions in MuJoCo's order, m, wxyz and rad; None of a body without joints."""
+        ...
+
     def reset(self, envs: Tensor, start: Start) -> None:
         """Put the robots ``envs`` (K,) at their starts."""
         ...

@@ -347,7 +347,10 @@ class Humanoids(Robots):
         self.batch.expand("geom_friction")[:, soles, 0] = friction.double().numpy()[:, None]
         torso = self.model.body("torso_link").id
         self.batch.expand("body_mass")[:, torso] = self.model.body_mass[torso] + payload.double().numpy()
+        volumes = self._held[VOLUMES].copy()
         self.batch.set_const()
+        # it measures them anew from what the model holds now, and that changes as the robot moves
+        self._held[VOLUMES][:] = volumes
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that decides the future: MuJoCo's integration state and the last contacts."""

@@ -5,18 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav import random
 from romnav.errors import RomnavError
 from romnav.robot.dynamics import Head
-from romnav.robot.g1 import HEAD, Humanoids
+from romnav.robot.g1 import HEAD, Humanoids, build_spec
 from romnav.robot.gaits import Gait, GaitLibrary
+from romnav.robot.heights import TileHeights
 from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
 from romnav.robot.locomotion.train import load_policy
-from romnav.robot.tiles import TileHeights, change_layer, geoms
+from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import NOTHING
+from romnav.robot.tiles import change_layer, geoms
 from romnav.world.solids import Label
 from romnav.world.spawns import Start
 from romnav.world.world import World
@@ -27,6 +32,28 @@ FOOTING = 0.35
 """Distance from the side of a stair or ramp within which nobody is put on it, m."""
 _CLOCK, _FRAME = range(2)
 _STATE = ("tile", "layer", "position", "yaw", "contacts", "fallen", "_env", "_resets", "_first")
+
+
+def _head_on(torso: Tensor, rotation: Tensor) -> Head:
+    """The sensors of robots whose torsos are at (E, 3), m, turned by (E, 3, 3)."""
+    turn = rotation.nan_to_num()
+    origin = (torso + turn @ torch.tensor(HEAD)).nan_to_num()
+    tilt = torch.stack([torch.atan2(turn[:, 2, 1], turn[:, 2, 2]), -turn[:, 2, 0].clamp(-1.0, 1.0).asin()], dim=1)
+    return Head(origin, heading_of(turn), tilt)
+
+
+class Skeleton:
+    """The body without its physics, for postures that are known."""
+
+    def __init__(self, spec: RobotSpec) -> None:
+        self._data = mujoco.MjData(build_spec(spec, NOTHING).compile())
+
+    def head(self, joints: NDArray[np.float64]) -> Head:
+        """The sensors (of one robot) that generalised positions (Q,) carry."""
+        self._data.qpos[:] = joints
+        mujoco.mj_kinematics(self._data.model, self._data)
+        torso = self._data.body("torso_link")
+        return _head_on(torch.tensor(torso.xpos[None]).float(), torch.tensor(torso.xmat.reshape(1, 3, 3)).float())
 
 
 class _Slope(NamedTuple):
@@ -57,6 +84,7 @@ class Humanoid:
         seed: int = 0,
         threads: int = 0,
         stair_speed: float | None = None,
+        first: int = 0,
     ) -> None:
         """
         Args:
@@ -68,6 +96,7 @@ class Humanoid:
             seed: of first feet and times along gaits.
             threads: of the physics; 0 means all cores. They do not change the result.
             stair_speed: fastest forward command followed while the next foothold is not level with the feet, m/s.
+            first: number of the first robot, where those before it are elsewhere; what is drawn depends on numbers.
 
         Raises:
             RomnavError: the checkpoint is missing, or the period is no multiple of the control step.
@@ -82,7 +111,7 @@ class Humanoid:
         self.yaw = torch.zeros(envs)
         self.contacts = torch.zeros(envs)
         self.fallen = torch.zeros(envs, dtype=torch.bool)
-        self._env = torch.arange(envs)
+        self._env = torch.arange(first, first + envs)
         self._resets = torch.zeros(envs, dtype=torch.int64)
         self._first = torch.ones(envs, dtype=torch.bool)
         self.robots = Humanoids(self._spec.robot, [geoms(tile.solids) for tile in world.tiles], envs, threads=threads)
@@ -185,10 +214,12 @@ class Humanoid:
     @property
     def head(self) -> Head:
         """Sensors as the torso carries them."""
-        turn = self.robots.torso_rotation.nan_to_num()
-        origin = (self.robots.torso + turn @ torch.tensor(HEAD)).nan_to_num()
-        tilt = torch.stack([torch.atan2(turn[:, 2, 1], turn[:, 2, 2]), -turn[:, 2, 0].clamp(-1.0, 1.0).asin()], dim=1)
-        return Head(origin, heading_of(turn), tilt)
+        return _head_on(self.robots.torso, self.robots.torso_rotation)
+
+    @property
+    def joints(self) -> Tensor:
+        """(E, 22): position, m, and orientation, wxyz, of the pelvis; then `JOINTS`, rad."""
+        return self.robots.state(torch.arange(len(self.tile)))[0]
 
     @torch.no_grad()
     def step(self, command: Tensor) -> None:

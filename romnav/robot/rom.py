@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from romnav.robot.dynamics import Head
 from romnav.world.spawns import Start
 from romnav.world.world import World
 
@@ -33,8 +34,9 @@ class ReducedOrderModel:
         self.contacts = torch.zeros(envs, device=device)
         self.fallen = torch.zeros(envs, dtype=torch.bool, device=device)
 
-    head = None
+    head: Head | None = None
     """Sensors stand upright above the ground, as on a standing humanoid (P)."""
+    joints: Tensor | None = None
 
     @property
     def proprioception(self) -> Tensor:

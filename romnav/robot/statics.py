@@ -100,6 +100,9 @@ class Slots:
 
     Args:
         grounds: that robots may be on.
+
+    Attributes:
+        ids: (k,) geoms of the compiled model that are slots.
     """
 
     def __init__(self, grounds: Sequence[Geoms]) -> None:
@@ -112,7 +115,7 @@ class Slots:
         # one more, so that the body of the obstacles is never empty
         most[_OBSTACLE_BOX] += 1
         self._count = most.tolist()
-        self._ids = np.zeros(0, int)
+        self.ids = np.zeros(0, int)
 
     def add_to(self, model: mujoco.MjSpec) -> None:
         """Add the slots, empty."""
@@ -126,12 +129,12 @@ class Slots:
 
     def attach(self, model: mujoco.MjModel) -> None:
         """Find the slots in a compiled model; whatever holds them and the floor is everywhere in it from now on."""
-        self._ids = np.array(
+        self.ids = np.array(
             [model.geom(f"slot{group}_{k}").id for group, count in enumerate(self._count) for k in range(count)]
         )
-        self._empty = {name: getattr(model, name)[self._ids].copy() for name in FIELDS}
+        self._empty = {name: getattr(model, name)[self.ids].copy() for name in FIELDS}
         bodies = (0, model.body(OBSTACLES).id)
-        self._nodes, self._leaves, self._ranges = _volumes(model, bodies, self._ids)
+        self._nodes, self._leaves, self._ranges = _volumes(model, bodies, self.ids)
 
     def fill(self, fields: Mapping[str, NDArray], robot: int, ground: int, cube: NDArray[np.int64]) -> None:
         """Hold what is within reach of a cube.
@@ -146,7 +149,7 @@ class Slots:
         low, high = self._bounds[ground]
         near = np.flatnonzero(((low < (cube + 1) * CUBE + REACH) & (high > cube * CUBE - REACH)).all(1))
         group = self._groups[ground][near]
-        slots, begin = np.full(len(self._ids), -1), 0
+        slots, begin = np.full(len(self.ids), -1), 0
         for k, count in enumerate(self._count):
             mine = near[group == k]
             slots[begin : begin + len(mine)] = mine
@@ -155,9 +158,9 @@ class Slots:
         for name in FIELDS:
             value = self._empty[name].copy()
             value[held] = self._fields[ground][name][slots[held]]
-            fields[name][robot, self._ids] = value
+            fields[name][robot, self.ids] = value
         if VOLUMES in fields:
-            ends = np.tile(np.array(_AWAY), (2, len(self._ids), 1))
+            ends = np.tile(np.array(_AWAY), (2, len(self.ids), 1))
             ends[0, held], ends[1, held] = low[slots[held]], high[slots[held]]
             lowest = np.minimum.reduceat(ends[0, self._leaves], self._ranges)[::2]
             highest = np.maximum.reduceat(ends[1, self._leaves], self._ranges)[::2]

@@ -1,4 +1,4 @@
-"""Tiles of the world as the ground of the humanoid: collision geoms and height maps, both from the solids."""
+"""Tiles of the world as the ground of the humanoid: collision geoms from the solids, and the layer underfoot."""
 
 from __future__ import annotations
 
@@ -9,13 +9,7 @@ from torch import Tensor
 
 from romnav.robot.statics import BOX, CYLINDER, MESH, Geoms
 from romnav.world.solids import Shape, Solids
-from romnav.world.tile import Tile
 from romnav.world.world import World
-
-CELL = 0.025
-"""Cell of the height maps, m: a tenth of a tread."""
-NOWHERE = -32768
-"""Height, mm, where a layer has no walking surface."""
 
 
 def geoms(solids: Solids) -> Geoms:
@@ -48,69 +42,6 @@ def _corners(solids: Solids) -> NDArray[np.float64]:
     lower = -half + solids.slope_bottom[:, None] * u
     lower -= np.maximum(0.01 - (upper - lower).min(1, keepdims=True), 0.0)
     return np.concatenate([np.stack([u, v, z], axis=-1) for z in (upper, lower)], axis=1)
-
-
-def surfaces(tile: Tile, cell: float = CELL) -> NDArray[np.int16]:
-    """(L, N, N) height of the walking surface of every layer at the middle of each cell, mm; else `NOWHERE`."""
-    count = round(tile.side / cell)
-    heights = np.full((len(tile.layers), count, count), NOWHERE, np.int16)
-    solids = tile.solids[tile.solids.walkable]
-    for i in range(len(solids)):
-        reach = np.hypot(*solids.half[i])
-        low = np.clip(np.floor((solids.centre[i] - reach) / cell).astype(int), 0, count)
-        high = np.clip(np.ceil((solids.centre[i] + reach) / cell).astype(int) + 1, 0, count)
-        x, y = ((np.arange(a, b) + 0.5) * cell for a, b in zip(low, high, strict=True))
-        points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-        u, v = solids[i : i + 1].local(points)
-        inside = (
-            (np.abs(u) <= solids.half[i, 0]) & (np.abs(v) <= solids.half[i, 1])
-            if solids.shape[i] == Shape.BOX
-            else np.hypot(u, v) <= solids.half[i, 0]
-        )
-        top = np.round(1000 * (solids.top[i] + solids.slope_top[i] * u))
-        value = np.where(inside, top, NOWHERE).astype(np.int16).reshape(len(x), len(y))
-        for layer in range(solids.layers[i, 0], solids.layers[i, 1] + 1):
-            part = heights[layer, low[0] : high[0], low[1] : high[1]]
-            np.maximum(part, value, out=part)
-    return heights
-
-
-class TileHeights:
-    """Walking surfaces under robots that are each on a tile of their own; called like a `HeightMap`.
-
-    Attributes:
-        tile: (n,) of each robot.
-    """
-
-    def __init__(self, tiles: tuple[Tile, ...]) -> None:
-        self._tiles = tiles
-        self._slot = torch.full((len(tiles),), -1, dtype=torch.long)
-        self._layers = max(len(tile.layers) for tile in tiles)
-        self._maps = torch.empty(0)
-        self.tile = torch.empty(0, dtype=torch.long)
-
-    def place(self, tile: Tensor) -> None:
-        """Robots are on tiles (n,) now; heights of new tiles are made."""
-        self.tile = tile.clone()
-        new = [t for t in tile.unique().tolist() if self._slot[t] < 0]
-        made: list[NDArray[np.int16]] = []
-        for t in new:
-            self._slot[t] = len(self._maps) + len(made)
-            layers = surfaces(self._tiles[t])
-            made.append(np.pad(layers, ((0, self._layers - len(layers)), (0, 0), (0, 0)), constant_values=NOWHERE))
-        if made:
-            fresh = torch.from_numpy(np.stack(made))
-            self._maps = torch.cat([self._maps, fresh]) if len(self._maps) else fresh
-
-    def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
-        """Height (n, ...) of the highest surface not above `reach` under points (n, ..., 2); 0 where there is none."""
-        index = (points / CELL).floor().long().clamp(0, self._maps.shape[-1] - 1)
-        slot = self._slot[self.tile].reshape(-1, *[1] * (points.ndim - 2))
-        at = self._maps[slot, :, index[..., 0], index[..., 1]]
-        height = at.float() / 1000
-        allowed = (at != NOWHERE) & (height <= reach[..., None])
-        below = torch.where(allowed, height, -torch.inf).amax(-1)
-        return torch.where(below.isfinite(), below, 0.0)
 
 
 def change_layer(world: World, tile: Tensor, layer: Tensor, xy: Tensor, z: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from romnav.robot.g1 import Robots
@@ -47,10 +48,18 @@ class WarpHumanoids(Robots):
 
     def _surround(self, pelvis: NDArray[np.float64]) -> NDArray[np.int64]:
         moved = super()._surround(pelvis)
-        rows = torch.from_numpy(moved).to(self.device)
-        for name, held in self._held.items():
-            own: Tensor = wp.to_torch(getattr(self._warp, name))
-            own[rows] = torch.from_numpy(held[moved]).reshape(len(moved), *own.shape[1:]).to(self.device)
+        if len(moved):
+            rows = torch.from_numpy(moved).to(self.device)
+            for name, held in self._held.items():
+                own: Tensor = wp.to_torch(getattr(self._warp, name))
+                own[rows] = torch.from_numpy(held[moved]).reshape(len(moved), *own.shape[1:]).to(self.device)
+            # geoms of bodies that do not move are placed once for all by MuJoCo Warp
+            place = np.ix_(moved, self._slots.ids)
+            turn = Rotation.from_quat(self._held["geom_quat"][place].reshape(-1, 4), scalar_first=True).as_matrix()
+            for name, value in (("geom_xpos", self._held["geom_pos"][place]), ("geom_xmat", turn)):
+                at = self._array(name)
+                to = torch.from_numpy(value).reshape(len(moved), -1, *at.shape[2:]).to(at)
+                at[rows[:, None], torch.from_numpy(self._slots.ids).to(self.device)] = to
         return moved
 
     def _array(self, name: str) -> Tensor:

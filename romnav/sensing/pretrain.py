@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from romnav import files, random, stopping
 from romnav.errors import RomnavError
+from romnav.journal import Journal
 from romnav.precision import reduced_precision
 from romnav.progress import Progress
 from romnav.sensing import encoder as checkpoints
@@ -164,7 +165,8 @@ def pretrain(
     progress: Progress = lambda done, total, metric: None,
     resume: bool = True,
 ) -> Path:
-    """Train an encoder on images of ``tiles`` and write ``encoder.pt`` and ``curve.csv`` into ``out``.
+    """Train an encoder on images of ``tiles`` and write ``encoder.pt`` and ``curve.csv`` into ``out``, the latter as
+    TensorBoard's events, too.
 
     Images are rendered as they are needed: each is a function of the seed and its index. A run that was killed
     goes on from ``state.pt`` and ends with the same weights as one that was not; a finished one does nothing.
@@ -193,15 +195,20 @@ def pretrain(
     state = _Training(spec, sensor, poses, key, device)
     if resume and state_path.exists():
         state.restore(state_path)
+    journal = Journal(out, state.step)
     # batches are small: a second thread gains nothing, and another number of threads gives other bits
     with torch_threads(1), stopping.deferred() as stop:
         while state.step < state.steps:
             text = state.advance()
+            if row := state.row():
+                journal.add(state.step, row)
             done = min(state.step * spec.batch, spec.images * spec.epochs)
             progress(done, spec.images * spec.epochs, text)
             if stop or (state.step % CHECKPOINT_INTERVAL == 0 and state.step < state.steps):
+                journal.flush()
                 state.save(state_path)
             stop.obey()
+    journal.close()
     files.write(out / "curve.csv", state.curve())
     state.check()
     checkpoints.save(path, state.model, {"key": key})
@@ -250,6 +257,14 @@ class _Training:
             self._rows.append([self.step, rate, float(mean.sum()), *mean.tolist()])
             self._recent.zero_()
         return f"loss {terms.sum():.1f} nat"
+
+    def row(self) -> dict[str, float] | None:
+        """The row of the curve that the last step ended, if it did."""
+        if not self._rows or self._rows[-1][0] != self.step:
+            return None
+        _, rate, loss, *terms = self._rows[-1]
+        named = {f"loss_{name}": value for name, value in zip(TERMS, terms, strict=True)}
+        return {"learning_rate": rate, "loss_total": loss, **named}
 
     def _terms(self) -> Tensor:
         """(terms,) of the loss of the next batch, in the order of `TERMS`."""

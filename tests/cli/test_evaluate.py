@@ -32,6 +32,13 @@ def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
     assert message.endswith("run `romnav train policy rom --seed 0 --scale smoke`")
 
 
+def test_joints_are_kept_of_humanoids_only(project: Path) -> None:
+    message = "--joints: oracle is driven on a body without joints; only the humanoid has them"
+    assert fails("eval", "oracle", "--joints") == message
+    assert fails("eval", "--paired", "--joints").startswith("--joints: are those of evaluated arms; name arms")
+    assert fails("eval", "rom", "--kept", "--joints").startswith("--joints: are those of evaluated arms; name arms")
+
+
 def test_results_are_printed_for_people_and_for_scripts(evaluated: Path) -> None:
     data = json.loads(romnav("results", "--json").stdout)
     assert data["scale"] == "smoke"

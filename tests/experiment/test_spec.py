@@ -10,6 +10,7 @@ from romnav.errors import RomnavError
 from romnav.experiment.project import Project
 from romnav.experiment.scales import ScaleFile
 from romnav.experiment.spec import Experiment, load_experiments, parse, suggest
+from romnav.navigation.spec import KickstartSpec
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENT = """
@@ -210,6 +211,22 @@ def test_an_arm_on_another_body_begins_with_the_settings_of_that_body(scales: Pa
     assert scale.changed("hum", at_scale, Path("e.toml")).navigation.env.envs == 10
 
 
+def test_how_a_body_is_taught_is_for_arms_with_a_teacher(scales: Path) -> None:
+    file = scales / "smoke.toml"
+    file.write_text(file.read_text() + BODIES + '[bodies.g1.kickstart]\ninit = "teacher"\ncritic_first = 0.1\n')
+    taught = (
+        '[arms.{}]\nlabel = "T"\nnavigation.dynamics = "{}"\nkickstart.teacher = "rom"\nkickstart.critic_first = 0.2\n'
+    )
+    text = EXPERIMENT.replace("forward = 0.5", 'forward = 0.5\nnavigation.dynamics = "g1"')
+    text += taught.format("nav", "g1") + taught.format("light", "rom")
+    experiment = parse(Experiment, tomllib.loads(text), Path("e.toml"))
+    scale = ScaleFile(scales, "smoke")
+    found = {name: scale.changed(name, experiment, Path("e.toml")).kickstart for name in experiment.arms}
+    assert found["rom"] is found["slow"] is None
+    assert found["nav"] == KickstartSpec(teacher="rom", init="teacher", critic_first=0.2)
+    assert found["light"] == KickstartSpec(teacher="rom", critic_first=0.2)
+
+
 def test_a_scale_of_one_body_has_its_settings(scales: Path) -> None:
     (scales / "smoke.toml").write_text('navigation.dynamics = "g1"\n' + BODIES)
     assert ScaleFile(scales, "smoke").settings.navigation.env.envs == 9
@@ -224,6 +241,7 @@ def test_a_scale_of_one_body_has_its_settings(scales: Path) -> None:
         ("[bodies.g1.evaluation]\nduration = 9.0", "bodies.g1.evaluation: set [evaluation] of the scale"),
         ('[bodies.g1.navigation]\ndynamics = "rom"', "bodies.g1.navigation.dynamics: it is g1 here; leave it out"),
         ("[bodies.g1]\nnavigation = 3", "key bodies.g1.navigation: input should be an object, not 3"),
+        ('[bodies.g1.kickstart]\ninit = "old"', "key bodies.g1.kickstart.init: input should be 'fresh' or 'teacher'"),
         ("[bodies]\ng1 = 3", "key bodies.g1: input should be an object, not 3"),
         ("[bodies.g2.lidar]\nrows = 3", "bodies.g2"),
         ("[bodys.g1.lidar]\nrows = 3", "unknown key bodys; did you mean bodies?"),

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from romnav.navigation.env import NavigationEnv, to_command
 from romnav.navigation.spec import CommandSpec, EnvSpec, NavigationSpec
@@ -116,3 +117,17 @@ def test_reward_statistics_add_up(world: World, perception: object, spec: Naviga
     env.statistics()
     total = sum(env.step(actions(12, step))[1].mean().item() for step in range(5))
     assert sum(env.statistics().reward.values()) == pytest.approx(total / 5, rel=1e-4)
+
+
+def test_environments_of_another_process_are_those_of_one(world: World, perception: object) -> None:
+    """What is drawn depends on the number of an environment, not on its place in the batch."""
+    spec = EnvSpec(envs=12, duration=2.0)
+
+    def drive(numbers: range) -> list[TensorDict]:
+        robots = ReducedOrderModel(world, len(numbers), spec.period)
+        env = NavigationEnv(world, robots, perception, spec, 3, "cpu", numbers)
+        return [env.step(torch.full((len(numbers), 3), 0.5))[0] for _ in range(15)]
+
+    for whole, share in zip(drive(range(12)), drive(range(6, 12)), strict=True):
+        for name, seen in share.items():
+            assert torch.equal(seen, whole[name][6:]), name

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from romnav.errors import RomnavError
 from romnav.navigation import checkpoint, train
-from romnav.navigation.observations import STATE_SIZE
+from romnav.navigation.observations import PRIVILEGED_SIZE, STATE_SIZE
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.rewards import TERMS
 from romnav.navigation.spec import EncoderUseSpec, EnvSpec, NavigationSpec, PolicySpec, PPOSpec, RewardSpec
@@ -28,6 +28,7 @@ from romnav.stopping import Stopped
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
 from romnav.world.world import World
+from tests.test_journal import told
 
 from .conftest import TOKENS, FakePerception, fake_encoder
 
@@ -342,3 +343,32 @@ def test_a_run_on_the_humanoid_resumes_exactly(
     assert checkpoint.read(tmp_path / "half" / "checkpoint.pt")["iterations"] == 1
     train.train(spec, world, FakePerception(), tmp_path / "half", 1, body=body)
     assert_same(weights(tmp_path / "whole"), weights(tmp_path / "half"))
+
+
+def test_a_training_tells_its_curve(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
+    train.train(spec, world, perception, tmp_path, 0)
+    with (tmp_path / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    seen = told(tmp_path)
+    for tag, column in {
+        "reward/collision": "reward_collision",
+        "loss/value": "loss_value",
+        "run/seconds": "seconds",
+    }.items():
+        curve = [(int(r["steps"]), float(r[column])) for r in rows]
+        assert [step for step, _ in seen[tag]] == [step for step, _ in curve]
+        assert [value for _, value in seen[tag]] == pytest.approx([value for _, value in curve], rel=1e-4)
+
+
+def test_a_policys_file_has_its_critic(world: World, perception: object, spec: NavigationSpec, tmp_path: Path) -> None:
+    path = train.train(spec, world, perception, tmp_path, 0)
+    critic = checkpoint.load_critic(path)
+    assert critic is not None
+    seen = TensorDict({"critic": torch.rand(5, STATE_SIZE + PRIVILEGED_SIZE)}, batch_size=[5])
+    assert critic(seen).unique().shape == (5,)
+    content = checkpoint.read(path)
+    checkpoint.save(path, {**content, "critic": {**content["critic"], "mlp.0.bias": torch.zeros(3)}})
+    with pytest.raises(RomnavError, match=r"policy\.pt: key 'critic' .*train the arm again"):
+        checkpoint.load_critic(path)
+    checkpoint.save(path, {name: value for name, value in content.items() if name != "critic"})
+    assert checkpoint.load_critic(path) is None

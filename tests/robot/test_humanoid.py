@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from romnav.errors import RomnavError
 from romnav.robot.g1 import HEAD
 from romnav.robot.gaits import GaitLibrary
-from romnav.robot.humanoid import Humanoid
+from romnav.robot.humanoid import Humanoid, Skeleton
 from romnav.robot.locomotion.train import train
 from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec
 from romnav.world.build import build
@@ -120,6 +120,10 @@ def test_it_feels_its_gait_its_turning_and_gravity_and_its_head_sways(world: Wor
     torso = np.array([-0.0039635, 0.0, 0.044])  # of the model, with a straight waist
     expected = body.robots.pelvis.numpy() + turn.apply(torso + np.array(HEAD))
     np.testing.assert_allclose(head.origin, expected, atol=1e-4)
+    skeleton = Skeleton(SPEC.robot)
+    for robot_, joints in enumerate(body.joints.numpy()):  # what its joints alone tell of its head
+        for whole, part in zip(head, skeleton.head(joints), strict=True):
+            torch.testing.assert_close(part[0], whole[robot_], atol=1e-4, rtol=0)
 
 
 def test_a_start_on_a_stair_faces_along_it_on_the_middle_of_a_tread(world: World, checkpoint: Path) -> None:

@@ -31,6 +31,7 @@ from romnav.world.grids import Grids, rasterise
 from romnav.world.solids import Label, SolidsBuilder
 from romnav.world.spec import GridSpec
 from romnav.world.tile import Tile, TileClass
+from tests.test_journal import told
 
 HEIGHT = 1.265
 SPEC = PretrainSpec(
@@ -182,6 +183,9 @@ def test_the_loss_falls_and_is_logged_term_by_term(trained: Path) -> None:
         rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
     assert rows[-1]["step"] == 24
     assert rows[-1]["loss"] == pytest.approx(sum(rows[-1][t] for t in TERMS), rel=1e-4)
+    seen = told(trained.parent)
+    for term in TERMS:
+        assert seen[f"loss/{term}"] == [(row["step"], pytest.approx(row[term], rel=1e-4)) for row in rows]
 
 
 class Killed(Exception):

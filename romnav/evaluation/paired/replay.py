@@ -1,8 +1,8 @@
 """One episode again, with all that the robot sees, decides and feels on the way.
 
-A robot of the reduced-order model is led along its recorded way and meets the noise that it met then, so it sees what
-it saw. A humanoid, of which joints are not recorded, is driven again; products round differently in a batch of one, so
-that its way may become another one.
+A robot is led along its recorded way and meets the noise that it met then, so it sees what it saw. A humanoid whose
+postures are not recorded is driven again; products round differently in a batch of one, so that its way may become
+another one.
 """
 
 from __future__ import annotations
@@ -15,18 +15,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.paired.expected import Expected
+from romnav.evaluation.postures import Postures
 from romnav.evaluation.rollout import Driver, Outcomes, Policy, View
 from romnav.evaluation.shield import Shield
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.evaluation.tracks import Tracks
 from romnav.navigation.env import to_command
 from romnav.navigation.perception import viewpoint
+from romnav.navigation.ppo import PrivilegedCritic
 from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
-from romnav.robot.dynamics import Body
-from romnav.robot.humanoid import Humanoid
+from romnav.robot.dynamics import Body, Dynamics
+from romnav.robot.humanoid import Skeleton
 from romnav.robot.rom import ReducedOrderModel
+from romnav.robot.spec import RobotSpec
+from romnav.robot.tiles import change_layer
 from romnav.threads import torch_threads
+from romnav.world.spawns import Start
 from romnav.world.world import World
 
 
@@ -69,6 +75,8 @@ class Replay:
     """(K, 3) (vx, vy, wz), m/s and rad/s."""
     sight: Sight | None
     """None of a scripted arm."""
+    value: NDArray[np.float32] | None
+    """(K,) return that the critic expects; None where there is none."""
     barrier: NDArray[np.float32] | None
     """(K,) value h of the safety filter's Poisson function, positive where safe; None without a filter."""
     filtered: NDArray[np.float32] | None
@@ -78,28 +86,59 @@ class Replay:
 class _Led(ReducedOrderModel):
     """A robot that goes where it went, whatever it is told."""
 
-    def __init__(self, world: World, envs: int, period: float, tracks: Tracks, episode: int) -> None:
-        super().__init__(world, envs, period)
+    def __init__(self, world: World, period: float, tracks: Tracks, episode: int) -> None:
+        super().__init__(world, 1, period)
         samples = tracks.of(episode)
         columns = (tracks.position[samples], tracks.yaw[samples], tracks.contact[samples])
         self._position, self._yaw, self._contact = map(torch.from_numpy, columns)
-        self._sample = 0
+        self._now = slice(0, 1)
 
     def step(self, command: Tensor) -> None:
         """Go to the next sample."""
-        self._sample += 1
-        one = slice(self._sample, self._sample + 1)
-        self.position, self.yaw, self.contacts = self._position[one], self._yaw[one], self._contact[one].float()
+        self._go(self._now.stop)
+
+    def _go(self, sample: int) -> None:
+        now = self._now = slice(sample, sample + 1)
+        self.position, self.yaw, self.contacts = self._position[now], self._yaw[now], self._contact[now].float()
+        xy, z = self.position[:, :2], self.position[:, 2]
+        self.layer = change_layer(self.world, self.tile, self.layer, xy, z)
+
+
+class _LedHumanoid(_Led):
+    """A humanoid that goes and holds itself as it did."""
+
+    def __init__(
+        self, world: World, period: float, tracks: Tracks, episode: int, postures: Postures, robot: RobotSpec
+    ) -> None:
+        super().__init__(world, period, tracks, episode)
+        self._joints, self._felt = (torch.from_numpy(x[tracks.of(episode)]) for x in (postures.joints, postures.felt))
+        self._skeleton = Skeleton(robot)
+
+    def reset(self, envs: Tensor, start: Start) -> None:
+        """It starts where it did: walking on stairs, it may have been off ``start``."""
+        super().reset(envs, start)
+        self._go(0)
+
+    @property
+    def proprioception(self) -> Tensor:
+        """(1, P) as it was recorded."""
+        return self._felt[self._now]
+
+    def _go(self, sample: int) -> None:
+        super()._go(sample)
+        self.joints, self.head = self._joints[self._now], self._skeleton.head(self._joints[sample].numpy())
 
 
 class _Witness:
-    """Drives as its driver does, and keeps what that one saw."""
+    """Drives as its driver does, and keeps what that one saw and expected."""
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: Driver, expected: Expected | None) -> None:
         self.driver = driver
+        self.expected = expected
         self.ranges: list[Tensor] = []
         self.poses: list[tuple[Tensor, Tensor]] = []
         self.beta: list[Tensor] = []
+        self.value: list[Tensor] = []
 
     def command(self, view: View) -> Tensor:
         policy = self.driver
@@ -111,6 +150,8 @@ class _Witness:
         self.ranges.append(eye.ranges(view.robot, view.counters())[0])
         memory = actor.get_hidden_state()
         self.beta.append(actor.beta(obs)[0])
+        if self.expected:
+            self.value.append(self.expected(view, obs["state"]))
         actor.reset(hidden_state=memory)
         return to_command(actor(obs), view.env.command)
 
@@ -137,22 +178,30 @@ def replay(
     spec: EvaluationSpec,
     *,
     tracks: Tracks | None = None,
+    postures: tuple[Postures, RobotSpec] | None = None,
     body: Body = ReducedOrderModel,
+    critic: PrivilegedCritic | None = None,
     shield: Shield | None = None,
     progress: Progress | None = None,
 ) -> Replay:
     """Go through one of ``episodes`` again while ``shield`` looks on; everything is on the CPU.
 
-    The robot is led along its way in ``tracks``, if they are given, and otherwise driven on what ``body`` makes.
+    The robot is led along its way in ``tracks``, if they are given, a humanoid in its ``postures`` of that way, and
+    otherwise driven on what ``body`` makes. ``critic`` is the policy's, if it is known.
     """
     one = EpisodeSet(episodes.name, episodes.world, {k: v[episode : episode + 1] for k, v in episodes.columns.items()})
     with torch_threads(spec.threads):
-        robot = _Led(world, 1, env.period, tracks, episode) if tracks else body(world, 1, env.period)
+        robot: Dynamics
+        if tracks and postures:
+            robot = _LedHumanoid(world, env.period, tracks, episode, *postures)
+        else:
+            robot = _Led(world, env.period, tracks, episode) if tracks else body(world, 1, env.period)
         view = View(world, one, env, robot)
         view.noise = torch.tensor([episode])
-        outcomes, witness = Outcomes(view, spec.duration, spec.reach), _Witness(driver)
+        expected = Expected(critic, view, torch.from_numpy(one.cross), env.duration) if critic else None
+        outcomes, witness = Outcomes(view, spec.duration, spec.reach), _Witness(driver, expected)
         steps = range(1, int(tracks.first[episode + 1] - tracks.first[episode])) if tracks else outcomes.steps(progress)
-        poses, joints, commands, filtered = [_pose(view)], [_joints(view)], [], []
+        poses, joints, commands, filtered = [_pose(view)], [_joints(robot)], [], []
         for step in steps:
             command = witness.command(view)
             if shield:
@@ -162,7 +211,7 @@ def replay(
             view.previous, view.step = command, step
             commands.append(command[0])
             poses.append(_pose(view))
-            joints.append(_joints(view))
+            joints.append(_joints(robot))
             if not tracks:
                 outcomes.add(before)
     samples = np.stack(poses)
@@ -173,6 +222,7 @@ def replay(
         joints=np.stack([j for j in joints if j is not None]) if joints[0] is not None else None,
         command=torch.stack(commands).numpy(),
         sight=witness.sight(),
+        value=torch.cat(witness.value).numpy() if witness.value else None,
         barrier=torch.cat([f.h for f in filtered]).float().numpy() if filtered else None,
         filtered=torch.cat([f.velocity for f in filtered]).float().numpy() if filtered else None,
     )
@@ -183,6 +233,5 @@ def _pose(view: View) -> NDArray[np.float32]:
     return torch.cat([robot.position[0], robot.yaw, robot.contacts]).numpy().astype(np.float32)
 
 
-def _joints(view: View) -> NDArray[np.float64] | None:
-    robot = view.robot
-    return robot.robots.state(torch.tensor([0]))[0][0].double().numpy() if isinstance(robot, Humanoid) else None
+def _joints(robot: Dynamics) -> NDArray[np.float64] | None:
+    return None if robot.joints is None else robot.joints[0].double().numpy()

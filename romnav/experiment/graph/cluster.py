@@ -20,6 +20,8 @@ from romnav.progress import lines
 
 RETRIES = 10
 """Times that a stage whose machine has died goes on elsewhere."""
+GRACE = 60.0
+"""What stages get to end an iteration and save when they are stopped, s."""
 
 
 class Queue(Protocol):
@@ -40,7 +42,7 @@ def execute_on_ray(
     """Runs stages as soon as those that they need are done, as many at a time as the cluster holds.
 
     A stage whose worker dies goes on from its checkpoint on another one. When a stage fails, or at Ctrl-C, the others
-    are stopped; what they have done is kept.
+    save and are stopped; what they have done is kept.
 
     Args:
         address: ``ray`` joins the cluster that ``RAY_ADDRESS`` names, or starts one here; ``ray://host:port`` joins
@@ -59,6 +61,7 @@ def execute_on_ray(
     try:
         import ray
         from ray.util.queue import Queue as RayQueue
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
     except ImportError as error:
         raise RomnavError("--on ray: Ray is not installed; run `pip install 'romnav[ray]'`") from error
     stages = list(stages)
@@ -71,7 +74,8 @@ def execute_on_ray(
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise RomnavError(f"--on {address}: {str(error).splitlines()[0]}; is the cluster there?") from error
     try:
-        queue = RayQueue(actor_options={"num_cpus": 0})
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+        queue = RayQueue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
         task = ray.remote(**needs, max_retries=RETRIES)(_run)
         running: dict[str, Any] = {}
         for stage in stages:
@@ -86,11 +90,11 @@ def execute_on_ray(
             try:
                 _wait(ray, list(running.values()))
             except BaseException:
-                for reference in running.values():
-                    ray.cancel(reference, force=True)
+                _stop(ray, list(running.values()))
                 raise
             finally:
-                queue.put(None)
+                with contextlib.suppress(Exception):  # the cluster may have gone
+                    queue.put(None)
                 shown.join(5.0)
     finally:
         ray.shutdown()
@@ -105,6 +109,18 @@ def _wait(ray: Any, references: list[Any]) -> None:
             raise error.cause if isinstance(error.cause, RomnavError) else error from None
         except ray.exceptions.RayError as error:
             raise RomnavError(f"--on ray: {str(error).splitlines()[0]}; run it again to go on") from error
+
+
+def _stop(ray: Any, references: list[Any]) -> None:
+    """Interrupts the stages, which save and end; those that do not in time, or at a second Ctrl-C, are killed."""
+    late = references
+    try:
+        for reference in references:
+            ray.cancel(reference)
+        _, late = ray.wait(references, num_returns=len(references), timeout=GRACE)
+    finally:
+        for reference in late:
+            ray.cancel(reference, force=True)
 
 
 def _show(queue: Queue, show: Callable[[str, str], None]) -> None:
@@ -130,5 +146,6 @@ class _Lines(io.TextIOBase):
     def write(self, text: str) -> int:
         *whole, self._rest = (self._rest + text).split("\n")
         for line in filter(None, whole):
-            self._queue.put((self._name, line))
+            with contextlib.suppress(Exception):  # that nobody is told of it stops no stage
+                self._queue.put((self._name, line))
         return len(text)

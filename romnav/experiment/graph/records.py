@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -24,6 +25,8 @@ from romnav.files import digest, write
 
 ROOT = Path(__file__).resolve().parents[3]
 """Folder of the code, a repository's where it is not installed."""
+SUM = "sha256"
+"""Key of a record's own checksum."""
 UNKNOWN = "unknown"
 """Commit where git does not tell it."""
 _PACKAGES = ("torch", "rsl-rl-lib", "mujoco", "warp-lang", "numpy")
@@ -56,10 +59,13 @@ def read(stage: Stage) -> Record | None:
         RomnavError: It is damaged.
     """
     try:
-        return Record(**json.loads(stage.record.read_text("utf-8")))
+        data = json.loads(stage.record.read_text("utf-8"))
+        if data.pop(SUM, None) not in (None, checksum(data)):
+            raise ValueError(f"its content does not have the {SUM} that it states")
+        return Record(**data)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise RomnavError(
             f"{stage.record}: damaged record ({error}); restore it, or delete it to run the stage again"
         ) from error
@@ -187,7 +193,13 @@ def finish(stage: Stage, record: Record, facts: dict[str, Any], seconds: float) 
 
 
 def _write(stage: Stage, record: Record) -> None:
-    write(stage.record, json.dumps(asdict(record), indent=2) + "\n")
+    data = json.loads(json.dumps(asdict(record)))  # as it will be read
+    write(stage.record, json.dumps({**data, SUM: checksum(data)}, indent=2) + "\n")
+
+
+def checksum(data: dict[str, Any]) -> str:
+    """SHA-256 of a record's content, however it is laid out; a record without one, of an older version, is believed."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def differences(stage: Stage) -> list[str]:

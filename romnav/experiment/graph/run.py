@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable
 from functools import partial
 from pathlib import Path
 
-from romnav import files
+from romnav import files, ranks
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
 from romnav.experiment.graph.lock import held
@@ -139,9 +139,18 @@ def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None
             raise files.unwritable(Path(error.filename or stage.folder), error) from error
 
 
+def follow(targets: Iterable[Stage], session: Session) -> None:
+    """In a process that is not the first of several: makes what that one calls, with it, until it lets go."""
+    known = {stage.name: stage for stage in targets}
+    while (name := ranks.hear()) is not None:
+        known[name].make(known[name], session, lambda done, total, metric: None)
+
+
 def _make(stage: Stage, session: Session) -> None:
     started = time.monotonic()
     record = records.begin(stage, session.resume)
+    if stage.shared:
+        ranks.call(stage.name)
     with bar(stage.name) as progress:
         facts = stage.make(stage, session, progress)
     records.finish(stage, record, facts, time.monotonic() - started)

@@ -79,6 +79,8 @@ class Stage:
     """Words after ``romnav`` that make it alone, if there is such a command."""
     on_request: bool = False
     """Whether it is made only where it is asked for itself: nobody should begin it by accident."""
+    shared: bool = False
+    """Whether several processes can make it together (`romnav.ranks`)."""
     arm: str | None = None
     """Arm that it trains or evaluates."""
     seed: int | None = None

@@ -19,13 +19,23 @@ from romnav.progress import Progress
 
 if TYPE_CHECKING:
     from romnav.evaluation.episodes import EpisodeSet
+    from romnav.evaluation.postures import Postures
+    from romnav.evaluation.tracks import Tracks
     from romnav.report.paired.gallery import EpisodeGallery
     from romnav.world.world import World
 
+POSTURES = "postures.npz"
 
-def episodes(work: Workspace, arm: str, seed: int) -> Stage:
-    """The evaluated episodes of a trained or scripted arm."""
+
+def episodes(work: Workspace, arm: str, seed: int, *, joints: bool = False) -> Stage:
+    """The evaluated episodes of a trained or scripted arm; with ``joints``, the humanoid's are kept beside its tracks.
+
+    Raises:
+        RomnavError: The arm's robots have no joints.
+    """
     driven = Driven.by(work, arm, seed)
+    if joints and driven.settings.navigation.dynamics != "g1":
+        raise RomnavError(f"--joints: {arm} is driven on a body without joints; only the humanoid has them")
     return Stage(
         kind="episodes",
         name=f"episodes {arm}, seed {driven.seed}",
@@ -34,7 +44,7 @@ def episodes(work: Workspace, arm: str, seed: int) -> Stage:
         record=driven.folder / "episodes.json",
         settings=driven.settings,
         uses=("evaluation", *driven.uses),
-        make=partial(_evaluate, driven),
+        make=partial(_evaluate, driven, joints),
         reads=(paired_set(work),),
         code=(f"rows {ROWS_VERSION}", *driven.code),
         upstream=driven.upstream,
@@ -65,21 +75,21 @@ def paired_set(work: Workspace) -> Path:
     return work.project.root / "experiments" / "episodes" / f"{work.settings.evaluation.episodes}.json"
 
 
-def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+def _evaluate(driven: Driven, joints: bool, stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
     import numpy as np
 
+    from romnav.evaluation import postures, tracks
     from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import rows
     from romnav.evaluation.paired.failures import classify
     from romnav.evaluation.paired.run import run
-    from romnav.evaluation.tracks import Recorder, write
 
     work, settings, path = driven.work, driven.settings, paired_set(driven.work)
     paired = load(path)
     world = terrain(paired, path, work.project.worlds).to(session.device)
     robots = body(work, settings, driven.seed, session.device, settings.evaluation.threads)
     driver = driven.driver(world, session.device)
-    recorder = Recorder()
+    recorder = postures.PostureRecorder() if joints else tracks.Recorder()
     measured = run(driver, world, paired, settings.navigation.env, settings.evaluation, progress, robots, recorder)
     count = len(paired)
     columns: dict[str, Any] = {
@@ -92,13 +102,17 @@ def _evaluate(driven: Driven, stage: Stage, session: Session, progress: Progress
         **{name: values for name, values in paired.columns.items() if name in rows.SCHEMA.names},
         **measured,
     }
-    tracks, period = recorder.tracks(count), settings.navigation.env.period
+    ways, period = recorder.tracks(count), settings.navigation.env.period
     columns["level"] = np.asarray(columns["level"])
-    columns["where"], columns["how"] = classify(tracks, columns, world, period)
+    columns["where"], columns["how"] = classify(ways, columns, world, period)
     provenance = driven.provenance(stage, paired.digest, settings.evaluation)
     rows.write(stage.folder / "episodes.parquet", rows.make(columns, provenance))
     source = {name: str(value) for name, value in provenance.model_dump().items()}
-    write(stage.folder / "tracks.npz", tracks, source)
+    tracks.write(stage.folder / "tracks.npz", ways, source)
+    if isinstance(recorder, postures.PostureRecorder):
+        postures.write(stage.folder / POSTURES, recorder.postures(count), ways, source)
+    else:
+        (stage.folder / POSTURES).unlink(missing_ok=True)  # of an earlier evaluation
     return {}
 
 
@@ -109,19 +123,31 @@ def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
         RomnavError: They are missing or out of date.
     """
     from romnav.evaluation.paired import rows
-    from romnav.evaluation.tracks import read
     from romnav.report.paired.gallery import EpisodeGallery
 
     stage, path = episodes(work, arm, seed), paired_set(work)
     run = rows.read(stage.folder / "episodes.parquet")
-    tracks, _ = read(stage.folder / "tracks.npz")
+    tracks, postures, _ = read_ways(stage.folder)
     paired, world = ground(path, work.project.worlds)
     if run.provenance.episode_set != paired.digest:
         raise RomnavError(
             f"{run.source}: rows of episode set {run.provenance.episode_set}, but {path} is {paired.digest}; "
             f"run `romnav {shlex.join(stage.command)}`"
         )
-    return EpisodeGallery(run, tracks, paired, world)
+    return EpisodeGallery(run, tracks, paired, world, postures)
+
+
+def read_ways(folder: Path) -> tuple[Tracks, Postures | None, dict[str, str]]:
+    """Tracks of an evaluation, postures if they were kept, and where they come from.
+
+    Raises:
+        RomnavError: A file is missing or damaged, or they are of two evaluations.
+    """
+    from romnav.evaluation import postures, tracks
+
+    ways, provenance = tracks.read(folder / "tracks.npz")
+    held = folder / POSTURES
+    return ways, postures.read(held, ways) if held.exists() else None, provenance
 
 
 @cache

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from romnav import files
+from romnav import files, ranks
 from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.scales import Scale
@@ -141,4 +141,5 @@ def humanoid(
         seed=seed,
         threads=threads,
         stair_speed=settings.navigation.stair_speed,
+        first=ranks.share(settings.navigation.env.envs).start,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from romnav import ranks
 from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.encoder import SENSORS, encoder, make_sensor
@@ -56,6 +57,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         scratch=("checkpoint.pt",),
         beside=("curve.csv", "kept", "kept.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
+        shared=True,
         arm=arm,
         seed=seed,
     )
@@ -99,8 +101,11 @@ def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, pro
         resume=session.resume,
         progress=progress,
     )
+    if ranks.rank() > 0:
+        return {}  # the first process tells, and it alone may see the file yet
     trained = checkpoint.read(path)
-    return {"steps": trained["steps"], "hours": trained["hours"]}
+    # the number of processes changes bits, as another machine does, but not the experiment: no setting, but recorded
+    return {name: trained[name] for name in ("steps", "hours", "processes") if name in trained}
 
 
 def perception(

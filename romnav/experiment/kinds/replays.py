@@ -12,7 +12,7 @@ import numpy as np
 from romnav.errors import RomnavError
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.encoder import encoder
-from romnav.experiment.kinds.episodes import ground, paired_set
+from romnav.experiment.kinds.episodes import ground, paired_set, read_ways
 from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
     from romnav.evaluation.episodes import EpisodeSet
     from romnav.evaluation.paired.replay import Replay, Sight
+    from romnav.evaluation.postures import Postures
     from romnav.evaluation.rollout import Driver
     from romnav.evaluation.tracks import Tracks
+    from romnav.navigation.ppo import PrivilegedCritic
     from romnav.world.world import World
 
 
@@ -41,15 +43,20 @@ class Again:
         return ground(paired_set(work), work.project.worlds)
 
     @cached_property
-    def _tracks(self) -> Tracks | None:
-        """Of the evaluation, if it was on these episodes."""
-        from romnav.evaluation.tracks import read
+    def _ways(self) -> tuple[Tracks | None, Postures | None]:
+        """Tracks of the evaluation, if it was on these episodes, and postures, if they were kept."""
+        if not (self._driven.folder / "tracks.npz").exists():
+            return None, None
+        tracks, postures, provenance = read_ways(self._driven.folder)
+        return (tracks, postures) if provenance["episode_set"] == self.ground[0].digest else (None, None)
 
-        file = self._driven.folder / "tracks.npz"
-        if not file.exists():
-            return None
-        tracks, provenance = read(file)
-        return tracks if provenance["episode_set"] == self.ground[0].digest else None
+    @cached_property
+    def _critic(self) -> PrivilegedCritic | None:
+        """Of the policy, if its file has one."""
+        from romnav.navigation.checkpoint import load_critic
+
+        trained = self._driven.policy
+        return load_critic(trained.folder / "policy.pt") if trained else None
 
     @cached_property
     def _driver(self) -> Driver:
@@ -72,17 +79,21 @@ class Again:
         if isinstance(driver, Policy):
             driver.actor.reset()
         walks = settings.navigation.dynamics == "g1"
-        robot = settings.locomotion.robot if walks else None
+        robot, env = settings.locomotion.robot, settings.navigation.env
+        tracks, postures = self._ways
+        shield = Shield(world, 1, settings.safety, env, robot if walks else None) if guarded else None
         return replay(
             driver,
             world,
             paired,
             episode,
-            settings.navigation.env,
+            env,
             settings.evaluation,
-            tracks=None if walks else self._tracks,
+            tracks=tracks if postures or not walks else None,
+            postures=(postures, robot) if postures else None,
             body=body(self._driven.work, settings, self._driven.seed, "cpu", settings.evaluation.threads),
-            shield=Shield(world, 1, settings.safety, settings.navigation.env, robot) if guarded else None,
+            critic=self._critic,
+            shield=shield,
             progress=progress,
         )
 
@@ -105,8 +116,9 @@ class Again:
             RomnavError: As `drive`; it cannot be drawn or written.
         """
         from romnav.report.paired.maps import shortest
-        from romnav.report.replay.video import RATE, Film, write
+        from romnav.report.replay.video import RATE, Film, check, write
 
+        check(path)
         again = self.drive(episode)
         paired, world = self.ground
         goal = np.array([paired.columns[f"goal_{axis}"][episode] for axis in "xyz"])

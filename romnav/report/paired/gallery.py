@@ -11,16 +11,19 @@ import pandas as pd
 from romnav.errors import RomnavError
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.paired.rows import HOW, WHERE, EpisodeRows
+from romnav.evaluation.postures import Postures
 from romnav.evaluation.tracks import Tracks
 from romnav.report.paired.maps import draw_maps
 from romnav.world.world import World
 
 
 class EpisodeGallery:
-    """Rows and tracks of an arm on the terrain they are of."""
+    """Rows and tracks of an arm on the terrain they are of, and a humanoid's postures if they were kept."""
 
-    def __init__(self, run: EpisodeRows, tracks: Tracks, episodes: EpisodeSet, world: World) -> None:
-        self.run, self.tracks, self.episodes, self.world = run, tracks, episodes, world
+    def __init__(
+        self, run: EpisodeRows, tracks: Tracks, episodes: EpisodeSet, world: World, postures: Postures | None = None
+    ) -> None:
+        self.run, self.tracks, self.episodes, self.world, self.postures = run, tracks, episodes, world, postures
 
     @cached_property
     def table(self) -> pd.DataFrame:

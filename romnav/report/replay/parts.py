@@ -7,6 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from romnav.robot.g1 import build_spec
 from romnav.robot.spec import RobotSpec
@@ -55,6 +56,26 @@ def parts(tile: Tile) -> list[Part]:
                 mesh = triangulate(tile.solids[chosen], segments=20)
                 out.append(Part(label, storey, mesh.vertices.astype(np.float32), mesh.triangles))
     return out
+
+
+class Motion:
+    """The humanoid between the samples of its joints, by cubic splines: a step takes two samples only.
+
+    Args:
+        joints: (K + 1, Q) generalised positions.
+    """
+
+    def __init__(self, joints: NDArray[np.float64]) -> None:
+        smooth, turn = joints.copy(), joints[:, 3:7]
+        # a quaternion and its negative are one orientation
+        same = np.where((turn[1:] * turn[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        smooth[1:, 3:7] *= np.cumprod(same)[:, None]
+        self._spline = CubicSpline(np.arange(len(smooth)), smooth)
+
+    def __call__(self, at: float) -> NDArray[np.float64]:
+        """(Q,) at a time, in samples; MuJoCo normalises the quaternion."""
+        between: NDArray[np.float64] = self._spline(at)
+        return between
 
 
 class Figure:

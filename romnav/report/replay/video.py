@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from romnav import files
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.replay import Replay
 from romnav.report.replay.opengl import FIX
-from romnav.report.replay.parts import ARMS, COLOURS, storeys
+from romnav.report.replay.parts import ARMS, COLOURS, Motion, storeys
 from romnav.robot.g1 import build_spec
 from romnav.robot.spec import RobotSpec
 from romnav.robot.statics import OBSTACLES
@@ -31,6 +32,8 @@ GLASS = 0.22
 """Opacity of obstacles as tall as the robot, which would hide it."""
 OVERHEAD = 1.9
 """What begins this far above the robot's feet is hidden, m."""
+UPSTAIRS = 0.5
+"""A floor this far above the robot's feet is translucent, m: on the way down, the camera looks through it."""
 BEHIND, ABOVE = (5.5, -32.0), (13.0, -89.0)
 """Distance, m, and elevation, degrees, of the cameras."""
 SKY = (0.93, 0.95, 0.98)
@@ -80,7 +83,8 @@ class Film:
         standing = tile.solids.top + np.abs(tile.solids.slope_top) * tile.solids.half[:, 0] > 1e-6
         solids = tile.solids[standing]
         scenery = _Scenery(solids)
-        if replay.joints is not None:
+        self._motion = None if replay.joints is None else Motion(replay.joints)
+        if self._motion is not None:
             spec = build_spec(robot, scenery, visual=True)
         else:
             spec = mujoco.MjSpec()
@@ -96,13 +100,13 @@ class Film:
             nose = [0.2, 0.05, 0.05]
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=[RADIUS, 0, HEIGHT - 0.2], size=nose, rgba=[1, 1, 1, 1])
         spec.geom("floor").rgba = [*np.array(COLOURS[Label.GROUND]) / 255.0, 1.0]
-        # without shadows, which take software most of its time
         sun = spec.worldbody.add_light(dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         sun.castshadow, sun.diffuse = False, [0.35] * 3
         spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.25] * 3
         spec.visual.headlight.specular = [0.0] * 3
         sky = {"builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT, "rgb1": SKY, "width": 8, "height": 48}
         spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, **sky)
+        spec.visual.quality.numslices, spec.visual.quality.numstacks = 12, 8
         spec.visual.global_.offwidth = spec.visual.global_.offheight = size
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
@@ -110,8 +114,11 @@ class Film:
         self._bottom = np.where(solids.walkable, solids.top, solids.bottom)
         self._alpha = self._model.geom_rgba[self._solids, 3].copy()
         self._ground = storeys(tile)[standing] == 0
+        self._floor = solids.walkable & (solids.label == Label.GROUND) & ~self._ground
         try:
             self._renderer = mujoco.Renderer(self._model, size, size)
+            for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+                self._renderer.scene.flags[flag] = False  # take software most of its time
         except Exception as error:  # of OpenGL, of any kind
             raise RomnavError(f"no OpenGL to draw with ({str(error).splitlines()[0]}); {FIX}") from error
 
@@ -134,14 +141,16 @@ class Film:
     def _picture(self, at: float, heading: float) -> NDArray[np.uint8]:
         k = int(at)
         position = _between(self._replay.position, at)
-        if self._replay.joints is not None:
-            self._data.qpos[:] = self._replay.joints[k]
+        if self._motion is not None:
+            self._data.qpos[:] = self._motion(at)
         else:
             yaw = self._yaw(at)
             self._data.mocap_pos[0] = position
             self._data.mocap_quat[0] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
         hidden = (self._bottom > position[2] + OVERHEAD) & ~self._ground
-        self._model.geom_rgba[self._solids, 3] = np.where(hidden, 0.0, self._alpha)
+        upstairs = self._floor & (self._bottom > position[2] + UPSTAIRS)
+        shown = np.where(upstairs, GLASS, self._alpha)
+        self._model.geom_rgba[self._solids, 3] = np.where(hidden, 0.0, shown)
         mujoco.mj_forward(self._model, self._data)
         views = []
         for distance, elevation in (BEHIND, ABOVE):
@@ -192,15 +201,26 @@ def _between(points: NDArray, at: float) -> NDArray[np.float64]:
     return np.asarray((1 - (at - k)) * points[k] + (at - k) * points[k + 1], np.float64)
 
 
+def check(path: Path) -> None:
+    """Makes sure that a video can be written to a path, which is better known before it is drawn.
+
+    Raises:
+        RomnavError: Its suffix names no type of video, the encoder of MP4 is not installed, or it cannot be written.
+    """
+    if path.suffix not in SUFFIXES:
+        raise RomnavError(f"--out {path}: a video is {' or '.join(SUFFIXES)}")
+    if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise RomnavError("--out: MP4 needs imageio-ffmpeg; run `pip install 'romnav[video]'`, or name a .gif")
+    files.prepare(path)
+
+
 def write(path: Path, frames: Iterator[NDArray[np.uint8]]) -> None:
     """Writes pictures as a video of the type that the suffix of ``path`` names.
 
     Raises:
-        RomnavError: It is of another type, or the encoder of MP4 is not installed.
+        RomnavError: As `check`.
     """
-    if path.suffix not in SUFFIXES:
-        raise RomnavError(f"--out {path}: a video is {' or '.join(SUFFIXES)}")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    check(path)
     if path.suffix == ".gif":
         images = [Image.fromarray(frame) for frame in frames]
         # one palette for all, so that what stands still costs nothing
@@ -209,12 +229,8 @@ def write(path: Path, frames: Iterator[NDArray[np.uint8]]) -> None:
         with files.atomic(path) as file:
             first.save(file, "GIF", save_all=True, append_images=rest, duration=1000 // RATE, loop=0, optimize=True)
         return
-    try:
-        import imageio_ffmpeg
-    except ModuleNotFoundError as error:
-        raise RomnavError(
-            "--out: MP4 needs imageio-ffmpeg; run `pip install 'romnav[video]'`, or name a .gif"
-        ) from error
+    import imageio_ffmpeg
+
     first_frame = next(frames)
     high, wide, _ = first_frame.shape
     writer = imageio_ffmpeg.write_frames(str(path), (wide, high), fps=RATE, macro_block_size=8)

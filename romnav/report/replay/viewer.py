@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import matplotlib
@@ -32,8 +33,9 @@ ZOOM = 4
 """Screen pixels of an image pixel, at least."""
 FRAME = 1 / 30
 """Time between two pictures of a playing replay, s."""
-UP, BACK = np.array([0.0, 0.0, 1.0]), np.array([-12.0, -12.0, 16.0])
-"""The vertical, and where an episode is looked at from, m."""
+UP = np.array([0.0, 0.0, 1.0])
+BACK, NEAR = np.array([-12.0, -12.0, 16.0]), np.array([-2.0, -2.0, 1.5])
+"""Where an episode and a robot are looked at from, m."""
 NO_TIME = {"x": viser.uplot.Scale(time=False)}
 SPEEDS = ("1", "2", "4", "8", "16")
 
@@ -84,7 +86,7 @@ class Viewer:
         self._episode, self._step = chosen[0], 0
         self._nodes: list[Any] = []
         self._bodies: dict[str, Any] = {}
-        self._joints: list[Any] = []
+        self._joints: dict[str, list[Any]] = {}
         try:
             self.server = viser.ViserServer(host=host, port=port, label="romnav", verbose=False)
         except OSError as error:
@@ -118,6 +120,7 @@ class Viewer:
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="4")
         self._storeys = gui.add_slider("storeys shown", 1, 4, 1, initial_value=4)
         self._follow = gui.add_checkbox("hide storeys above the robot", initial_value=True)
+        self._chase = gui.add_checkbox("go along with the robot", initial_value=False)
         self._shown = {name: gui.add_checkbox(name, initial_value=True) for name in names}
         with gui.add_folder("what an arm sees"):
             self._eyes = gui.add_dropdown(
@@ -136,6 +139,14 @@ class Viewer:
             self._betas = gui.add_uplot(
                 (grid, *(np.zeros_like(grid),) * 3), tuple(series), aspect=1.6, visible=False, scales=NO_TIME
             )
+            along = [viser.uplot.Series(label="s")]
+            along += [
+                viser.uplot.Series(label=name, stroke=stroke, width=2)
+                for name, stroke in (("expected return", "#7b3294"), ("h", "#b2182b"))
+            ]
+            self._along = gui.add_uplot(
+                (grid, *(np.zeros_like(grid),) * 2), tuple(along), aspect=1.6, visible=False, scales=NO_TIME
+            )
         self._choice.on_update(lambda _: self._open(int(self._choice.value)))
         self._time.on_update(lambda _: self._show(int(self._time.value)))
         for control in (self._storeys, self._follow):
@@ -147,9 +158,9 @@ class Viewer:
     def _open(self, episode: int) -> None:
         """Put up an episode: tile, ends, shortest path and ways."""
         with self._lock, self.server.atomic():
-            for node in (*self._nodes, *self._joints, *self._bodies.values()):
+            for node in (*self._nodes, *chain.from_iterable(self._joints.values()), *self._bodies.values()):
                 node.remove()
-            self._nodes, self._joints, self._bodies, self._episode = [], [], {}, episode
+            self._nodes, self._joints, self._bodies, self._episode = [], {}, {}, episode
             scene, row = self.server.scene, self._table.loc[episode]
             tile = self._world.tiles[int(row.tile)]
             self._floors, self._walls = [tile.layers[layer] for layer in tile.storeys], []
@@ -215,24 +226,38 @@ class Viewer:
             if mesh.visible != (storey <= last):
                 mesh.visible = storey <= last
 
+    def _go_along(self) -> None:
+        """Look at the first robot in sight from nearby, if that is asked for."""
+        robots = (body for name, body in self._bodies.items() if self._shown[name].value)
+        if self._chase.value and (robot := next(robots, None)):
+            for client in self.server.get_clients().values():
+                client.camera.position, client.camera.look_at = robot.position + NEAR, robot.position
+
     def _look(self) -> None:
         """Go through the episode again for the arm whose eyes are looked through."""
         name, episode = self._eyes.value, self._episode
-        for joint in self._joints:
-            joint.remove()
-        self._joints = []
         if name != "none" and (name, episode) not in self._seen:
             self._decided.content = "going through the episode again ..."
             self._seen[name, episode] = self._drive(name, episode)
         with self._lock:
-            seen = self._seen.get((name, episode))
-            if seen and seen.replay.joints is not None and episode == self._episode:
-                self._figure = self._figure or Figure(self._robot)
-                self._joints = [
-                    self.server.scene.add_mesh_simple(f"/joints/{k}", vertices, faces, color=tuple(colour))
-                    for k, (vertices, faces, colour) in enumerate(self._figure.meshes())
-                ]
+            for arm in self._galleries:
+                if self._postures(arm) is None:
+                    for mesh in self._joints.pop(arm, ()):
+                        mesh.remove()
+                elif arm not in self._joints:
+                    self._figure = self._figure or Figure(self._robot)
+                    self._joints[arm] = [
+                        self.server.scene.add_mesh_simple(f"/joints/{arm}/{k}", vertices, faces, color=tuple(colour))
+                        for k, (vertices, faces, colour) in enumerate(self._figure.meshes())
+                    ]
             self._show(self._step)
+
+    def _postures(self, name: str) -> NDArray[np.float64] | None:
+        """Joints (K + 1, Q) of an arm, kept by its evaluation or those of a humanoid that was driven again."""
+        gallery, seen = self._galleries[name], self._seen.get((name, self._episode))
+        if gallery.postures is not None:
+            return gallery.postures.joints[gallery.tracks.of(self._episode)]
+        return seen.replay.joints if seen and name == self._eyes.value else None
 
     def _seek(self, step: int) -> None:
         if self._time.value == step:
@@ -247,10 +272,18 @@ class Viewer:
             for name, body in self._bodies.items():
                 way = self._way(name)
                 body.position = way[min(step, len(way) - 1)] + UP * HEIGHT / 2
-                body.visible = self._shown[name].value and not (self._joints and name == self._eyes.value)
+                body.visible = self._shown[name].value and name not in self._joints
+            for name, meshes in self._joints.items():
+                joints = self._postures(name)
+                if joints is not None and self._figure:
+                    for mesh, at, turn in zip(
+                        meshes, *self._figure.place(joints[min(step, len(joints) - 1)]), strict=True
+                    ):
+                        mesh.position, mesh.wxyz, mesh.visible = at, turn, self._shown[name].value
             self._cut()
+            self._go_along()
             seen = self._seen.get((self._eyes.value, self._episode))
-            for shown in (self._range, self._classes, self._betas, self._points):
+            for shown in (self._range, self._classes, self._betas, self._along, self._points):
                 shown.visible = False
             self._decided.content = (
                 "" if seen is None else self._draw_sight(seen, min(step, len(seen.replay.command) - 1))
@@ -258,14 +291,16 @@ class Viewer:
 
     def _draw_sight(self, seen: Seen, step: int) -> str:
         replay, sight = seen.replay, seen.replay.sight
-        if replay.joints is not None and self._figure:
-            for joint, at, turn in zip(self._joints, *self._figure.place(replay.joints[step]), strict=True):
-                joint.position, joint.wxyz = at, turn
         vx, vy, wz = replay.command[step]
         lines = [f"command {vx:+.2f} m/s ahead, {vy:+.2f} m/s to the left, {wz:+.2f} rad/s"]
+        if replay.value is not None:
+            lines.append(f"expected return {replay.value[step]:.2f}")
+        elif sight is not None:
+            lines.append("expected return: the policy's file has no critic")
         if replay.barrier is not None and replay.filtered is not None:
             x, y = replay.filtered[step]
             lines.append(f"filter: h = {replay.barrier[step]:.2f}, would let {x:+.2f}, {y:+.2f} m/s through")
+        self._plot(replay, step)
         if sight is not None:
             self._points.points = sight.points(step)
             colours = matplotlib.colormaps["viridis_r"](np.clip(sight.ranges[step] / RANGE, 0, 1))[..., :3]
@@ -281,6 +316,16 @@ class Viewer:
             self._classes.image = _enlarged(palette[seen.labels[step]])
             self._classes.visible = True
         return "\n\n".join(lines)
+
+    def _plot(self, replay: Replay, step: int) -> None:
+        """Expected return and h up to a step, as far as they are known."""
+        rows = (replay.value, replay.barrier)
+        if all(row is None for row in rows):
+            return
+        time = EnvSpec().period * np.arange(step + 1)
+        blank = np.full(len(time), np.nan)
+        self._along.data = (time, *(blank if row is None else row[: step + 1].astype(float) for row in rows))
+        self._along.visible = True
 
     def _play(self) -> None:
         period, began, start = EnvSpec().period, time.monotonic(), 0

@@ -306,9 +306,8 @@ class Walker:
         centre = feet.clone()
         centre[rows, swing, :2] = self.foothold[:, :2]
         ahead = torch.stack([torch.cos(foot_yaw), torch.sin(foot_yaw)], dim=-1) * half
-        toe = ground(centre[..., :2] + ahead, reach[:, None])
-        middle = ground(centre[..., :2], reach[:, None])
-        heel = ground(centre[..., :2] - ahead, reach[:, None])
+        along = centre[:, None, :, :2] + torch.tensor([1.0, 0.0, -1.0])[:, None, None] * ahead[:, None]
+        toe, middle, heel = ground(along, reach[:, None, None]).unbind(1)
         # The sole lies along the ground where that is a plane, level where it is an edge.
         plane = ((toe + heel) / 2 - middle).abs() < 0.012
         pitch = torch.where(plane & ((toe - heel).abs() < 0.13), -torch.atan2(toe - heel, torch.tensor(2 * half)), 0.0)

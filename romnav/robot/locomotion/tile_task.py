@@ -8,10 +8,11 @@ from scipy import ndimage
 from torch import Tensor
 
 from romnav.robot.g1 import Humanoids
+from romnav.robot.heights import TileHeights
 from romnav.robot.locomotion.control import heading_of
 from romnav.robot.locomotion.task import WalkingEnv
-from romnav.robot.spec import LocomotionSpec
-from romnav.robot.tiles import TileHeights, change_layer, geoms
+from romnav.robot.spec import DRIVERS, LocomotionSpec, TileMixSpec
+from romnav.robot.tiles import change_layer, geoms
 from romnav.world.geodesic import UNIT
 from romnav.world.lookup import GeodesicLookup
 from romnav.world.world import LEVEL_GAP, MOUTH_RADIUS, World
@@ -48,8 +49,7 @@ class TileEnv(WalkingEnv):
         self._lookup = GeodesicLookup(world)
         self._starts = [_starts(world, k) for k in range(len(world.tiles))]
         self._hold = round(t.period / self.dt)
-        self._drivers = list(t.drivers)
-        self._mix = torch.tensor(list(t.drivers.values())).cumsum(0) / sum(t.drivers.values())
+        self.ask(t)
         self.layer = torch.zeros(n, dtype=torch.long)
         self.goal = torch.zeros(n, dtype=torch.long)
         self.driver = torch.zeros(n, dtype=torch.long)
@@ -59,8 +59,14 @@ class TileEnv(WalkingEnv):
         self.stray = torch.zeros(n)
         self._begin()
 
+    def ask(self, mix: TileMixSpec) -> None:
+        """What robots are asked for from now on; what is drawn for an episode is that of its beginning."""
+        self._mix = mix
+        shares = torch.tensor([mix.drivers[driver] for driver in DRIVERS])
+        self._chances = shares.cumsum(0) / sum(mix.drivers.values())
+
     def _start(self, ids: Tensor) -> tuple[Tensor, Tensor]:
-        t, world, k = self.spec.tiles, self.world, len(ids)
+        t, world, k = self._mix, self.world, len(ids)
         u = self._uniform(0.0, 1.0, k)
         kind = torch.where(u < t.mouth, 0, torch.where(u < t.mouth + t.wall, 1, 2))
         draws = self._uniform(0.0, 1.0, 3 * k).reshape(3, k)
@@ -70,7 +76,7 @@ class TileEnv(WalkingEnv):
             node[i] = nodes[int(draws[0, i] * len(nodes))]
             self.goal[ids[i]] = self._draw_goal(tile, node[i], bool(draws[1, i] < t.cross), float(draws[2, i]))
         self.layer[ids] = world.layer[node]
-        self.driver[ids] = torch.searchsorted(self._mix, self._uniform(0.0, 1.0, k)).clamp(max=len(self._mix) - 1)
+        self.driver[ids] = torch.searchsorted(self._chances, self._uniform(0.0, 1.0, k)).clamp(max=len(DRIVERS) - 1)
         fast = self._uniform(0.0, 1.0, k) < t.fast
         self.speed[ids] = torch.where(fast, t.speed[1], self._uniform(*t.speed, k))
         self.stray[ids] = 0.0
@@ -96,15 +102,15 @@ class TileEnv(WalkingEnv):
         return int(chosen[int(draw * len(chosen))])
 
     def _named(self, driver: str) -> Tensor:
-        return self.driver == self._drivers.index(driver)
+        return self.driver == DRIVERS.index(driver)
 
     def _ticks(self, k: int) -> Tensor:
         """(k,) ticks for which to hold drawn commands."""
-        low, high = self.spec.tiles.hold
+        low, high = self._mix.hold
         return ((low + (high - low) * self._uniform(0.0, 1.0, k).square()) / self.dt).long()
 
     def _drive(self) -> None:
-        t, r = self.spec.tiles, self.robots
+        t, r = self._mix, self.robots
         low = self.control.walker.soles(r)[..., 2].amin(1)
         xy = r.pelvis[:, :2]
         self.layer = change_layer(self.world, self.tile, self.layer, xy, self.heights(xy, low + STEP_UP))
@@ -151,7 +157,7 @@ class TileEnv(WalkingEnv):
 
     def _finish(self, ids: Tensor, fell: Tensor, over: Tensor) -> dict[str, float]:
         log: dict[str, float] = {}
-        for k, driver in enumerate(self._drivers):
+        for k, driver in enumerate(DRIVERS):
             mine = self.driver[ids] == k
             log[f"/ended/{driver}"] = int(mine.sum())
             log[f"/fallen/{driver}"] = int((fell[ids] & mine).sum())

@@ -20,12 +20,13 @@ from torch import Tensor
 
 from romnav import files, stopping
 from romnav.errors import RomnavError
+from romnav.journal import Journal
 from romnav.progress import Progress
 from romnav.robot.locomotion.lane_task import LocomotionEnv
 from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
-from romnav.robot.spec import LocomotionSpec, PpoSpec
+from romnav.robot.spec import LocomotionSpec, PpoSpec, TileMixSpec, TileTaskSpec
 from romnav.tensors import Kind, not_finite, require_finite
 from romnav.world.build import build
 
@@ -37,11 +38,17 @@ class Together(VecEnv):
     """Robots on lanes and, from some iteration on, on tiles, as one batch."""
 
     def __init__(self, lanes: LocomotionEnv, tiles: TileEnv | None = None) -> None:
+        self._tiles = tiles
         self.parts: list[WalkingEnv] = [lanes, *([tiles] if tiles else [])]
         self.cfg, self.num_actions, self.device = lanes.cfg, lanes.num_actions, "cpu"
         self.max_episode_length = lanes.max_episode_length
         self._counts = [part.num_envs for part in self.parts]
         self.num_envs = sum(self._counts)
+
+    def ask(self, mix: TileMixSpec) -> None:
+        """What robots on tiles are asked for from now on."""
+        if self._tiles:
+            self._tiles.ask(mix)
 
     def get_observations(self) -> TensorDict:
         """Observation groups of all robots."""
@@ -191,7 +198,7 @@ def train(
     save_every: float = 60.0,
     worlds: Path | None = None,
 ) -> Path:
-    """Train a policy; writes `out/policy.pt`, and `out/curve.csv` with a row per iteration.
+    """Train a policy; writes `out/policy.pt`, and `out/curve.csv` with a row per iteration; TensorBoard's events, too.
 
     Args:
         spec: what to train. When a run is resumed, `spec.iterations` may differ from the checkpoint's.
@@ -242,6 +249,7 @@ def train(
         torch.set_rng_state(saved["torch_random"])
     ppo.train_mode()
     obs = env.get_observations()
+    journal = Journal(out, spec.steps(done) if done else 0)
     begin = mark = time.monotonic()
     with stopping.deferred() as stop:
         for iteration in range(done + 1, spec.iterations + 1):
@@ -249,6 +257,7 @@ def train(
                 env = joined()
                 obs = env.get_observations()
                 ppo.storage = RolloutStorage("rl", env.num_envs, spec.ppo.steps, obs, [env.num_actions])
+            env.ask(spec.tiles.mix(iteration))
             rows: list[dict[str, float]] = []
             total, clock = 0.0, time.monotonic()
             with torch.inference_mode():
@@ -276,23 +285,34 @@ def train(
             } | losses  # fmt: skip
             _check_finite(path, iteration, row, ppo)
             curve.append(row)
+            of_losses = {f"loss_{name}": value for name, value in losses.items()}
+            journal.add(row["steps"], {name: row[name] for name in row.keys() - losses.keys()} | of_losses)
             if progress:
                 progress(iteration, spec.iterations, f"reward {row['reward']:.2f}, fell {row['fell']:.2f}/s")
             if stop or time.monotonic() - mark > save_every or iteration == spec.iterations:
                 mark = time.monotonic()
+                journal.flush()
                 _write_curve(out / "curve.csv", curve)  # first: a resumed run drops what is there too much
                 _save(path, spec, ppo, average, env, iteration, row["seconds"])
             stop.obey()
+    journal.close()
     return path
 
 
 def _leads_to(saved: dict[str, Any], spec: LocomotionSpec) -> bool:
-    """Whether a run of `spec` passes through a checkpoint: without robots on tiles as long as it has none."""
-    then = LocomotionSpec.model_validate_json(saved["spec"])
-    now = spec.model_copy(update={"iterations": then.iterations})
-    if saved["iteration"] <= spec.tiles.begin and (then.tiles.robots == 0 or saved["iteration"] <= then.tiles.begin):
-        now = now.model_copy(update={"tiles": then.tiles})
-    return now == then
+    """Whether a run of `spec` passes through a checkpoint."""
+    done, then = saved["iteration"], LocomotionSpec.model_validate_json(saved["spec"])
+    return _until(spec, done) == _until(then, done)
+
+
+def _until(spec: LocomotionSpec, iteration: int) -> LocomotionSpec:
+    """What of a specification has an effect until an iteration."""
+    tiles = spec.tiles
+    if tiles.robots == 0 or iteration <= tiles.begin:
+        tiles = TileTaskSpec()
+    elif tiles.later and iteration <= tiles.later.begin:
+        tiles = tiles.model_copy(update={"later": None})
+    return spec.model_copy(update={"iterations": 1, "tiles": tiles})
 
 
 def _check_finite(path: Path, iteration: int, row: dict[str, float], ppo: PPO) -> None:

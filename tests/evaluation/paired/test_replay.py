@@ -9,6 +9,7 @@ from romnav.evaluation import episodes
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.paired.replay import replay
 from romnav.evaluation.paired.run import run
+from romnav.evaluation.postures import Postures
 from romnav.evaluation.rollout import Oracle, Policy
 from romnav.evaluation.shield import Shield
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec, TrialSpec
@@ -16,6 +17,7 @@ from romnav.evaluation.tracks import Recorder, Tracks
 from romnav.navigation.perception import Eye, Perception
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import EnvSpec, PolicySpec
+from romnav.robot.spec import RobotSpec
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import untrained
 from romnav.sensing.lidar import Lidar
@@ -84,6 +86,43 @@ def test_returns_lie_at_their_ranges_around_the_sensor(world: World, paired: Epi
         ranges = sight.ranges[step][sight.ranges[step] > 0]
         np.testing.assert_allclose(np.linalg.norm(points - sight.origin[step], axis=1), ranges, rtol=1e-4)
         assert points[:, 2].min() > again.position[:, 2].min() - 4.5
+
+
+def test_led_a_robot_is_on_the_layer_that_it_was_on(world: World, paired: EpisodeSet) -> None:
+    """The oracle, which descends the field of a layer, tells along the way what it told."""
+    (cross,) = np.flatnonzero(paired.cross)
+    spec = EvaluationSpec(duration=60.0)
+    recorder = Recorder()
+    run(Oracle(), world, paired, ENV, spec, recorder=recorder)
+    tracks = recorder.tracks(len(paired))
+    led = replay(Oracle(), world, paired, int(cross), ENV, spec, tracks=tracks)
+    free = replay(Oracle(), world, paired, int(cross), ENV, spec)
+    assert np.ptp(free.position[:, 2]) > 1.0
+    away = np.abs(led.command - free.command).max(axis=1)
+    assert np.quantile(away, 0.9) < 0.1
+
+
+def test_a_humanoid_holds_itself_as_it_did_and_its_eyes_are_in_its_head(
+    world: World, paired: EpisodeSet, policy: Policy
+) -> None:
+    tracks = recorded(policy, world, paired)
+    count = len(tracks.position)
+    joints, felt = np.zeros((count, 22)), np.linspace(0, 1, 8 * count, dtype=np.float32).reshape(count, 8)
+    joints[:, :3] = tracks.position + np.array([0, 0, 0.75])
+    joints[:, 3], joints[:, 6] = np.cos(tracks.yaw / 2), np.sin(tracks.yaw / 2)
+    policy.actor.reset()
+    again = replay(
+        policy, world, paired, CHOSEN, ENV, SPEC, tracks=tracks, postures=(Postures(joints, felt), RobotSpec())
+    )
+    way = tracks.of(CHOSEN)
+    assert again.joints is not None
+    assert again.sight is not None
+    np.testing.assert_array_equal(again.joints, joints[way])
+    np.testing.assert_array_equal(again.position, tracks.position[way])
+    above = again.sight.origin - again.position[:-1]
+    assert (np.hypot(above[:, 0], above[:, 1]) < 0.1).all()
+    assert ((above[:, 2] > 1.1) & (above[:, 2] < 1.35)).all()
+    np.testing.assert_allclose(np.cos(again.sight.heading - again.yaw[:-1]), 1.0, atol=1e-3)
 
 
 def test_a_scripted_arm_driven_again_goes_the_same_way(world: World, paired: EpisodeSet) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -11,12 +13,17 @@ from typing import Any
 
 import pytest
 
+from romnav import stopping
 from romnav.errors import RomnavError
+from romnav.evaluation import episodes
+from romnav.evaluation.spec import EpisodeSetSpec
 from romnav.experiment.graph import records
-from romnav.experiment.graph.cluster import execute_on_ray
+from romnav.experiment.graph.cluster import GRACE, execute_on_ray
 from romnav.experiment.graph.run import pending
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import Progress
+from romnav.world.build import build
+from romnav.world.spec import WorldSpec
 from tests.experiment.graph.test_run import Settings, stage, write
 
 NEEDS = {"num_cpus": 1, "num_gpus": 0, "memory": 1e8}
@@ -35,6 +42,19 @@ def count(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
         state.with_suffix(".new").write_text(str(step + 1))
         state.with_suffix(".new").replace(state)
         progress(step + 1, STEPS, "counted")
+    return write(this, session, progress)
+
+
+def save_when_asked(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    """Has nothing on disk until it is stopped, as a training between two checkpoints."""
+    this.folder.mkdir(parents=True, exist_ok=True)
+    (this.folder / "began").touch()
+    with stopping.deferred() as stop:
+        for _ in range(1000):
+            time.sleep(0.1)
+            if stop:
+                (this.folder / "checkpoint").write_text("saved")
+            stop.obey()
     return write(this, session, progress)
 
 
@@ -91,3 +111,72 @@ def test_the_first_failure_names_its_reason(tmp_path: Path, cluster: Any) -> Non
     with pytest.raises(RomnavError, match="this stage cannot"):
         execute_on_ray("ray", NEEDS, [good, bad], Session(), print)
     assert not records.finished(good)
+
+
+@pytest.mark.slow
+def test_stages_save_when_they_are_interrupted(tmp_path: Path, cluster: Any) -> None:
+    long = [stage(tmp_path, key, Settings(), make=save_when_asked, scratch=("checkpoint",)) for key in "ab"]
+
+    def interrupt() -> None:
+        while not all((one.folder / "began").exists() for one in long):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        execute_on_ray("ray", NEEDS, long, Session(), print)
+    assert time.monotonic() - begun < GRACE
+    assert [(one.folder / "checkpoint").read_text() for one in long] == ["saved"] * 2
+
+
+EXPERIMENT = """
+kind = "ablation"
+title = "Two arms"
+
+[tables.pair]
+caption = "Two arms"
+
+[arms.rom]
+label = "RoM"
+
+[arms.uniform]
+label = "Uniform"
+navigation.env.sampler.stair_probability = 0.0
+"""
+EVALUATION = """
+[evaluation]
+episodes = "few"
+duration = 8.0
+"""
+
+
+@pytest.fixture
+def ablation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Path]:
+    """The benchmark, and a project whose ablation "pair" takes a minute at scale "tiny"."""
+    pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "benchmarks")
+    project = tmp_path / "project"
+    (project / "experiments" / "scales").mkdir(parents=True)
+    (project / "experiments" / "pair.toml").write_text(EXPERIMENT)
+    (project / "experiments" / "scales" / "tiny.toml").write_text(importlib.import_module("_kills").TINY + EVALUATION)
+    terrain = WorldSpec(tiles=2, seed=3000, side=20.0, classes=("building", "outdoor"), goals_per_tile=8)
+    drawn = episodes.draw("few", EpisodeSetSpec(world=terrain, episodes=16, cross=4), build(terrain))
+    episodes.save(project / "experiments" / "episodes" / "few.json", drawn)
+    return importlib.import_module("raylets"), project
+
+
+@pytest.mark.slow
+def test_an_ablation_has_the_same_rows_on_a_cluster_that_loses_a_machine(
+    tmp_path: Path, ablation: tuple[Any, Path]
+) -> None:
+    raylets, project = ablation
+    raylets.warm(project, "tiny")
+    raylets.ablation(project, "pair", "tiny", tmp_path / "alone")
+    began = [tmp_path / "ray" / "tiny" / arm / "seed-0" / "spec.json" for arm in ("rom", "uniform")]
+    raylets.on_ray(project, "pair", "tiny", tmp_path / "ray", plug=lambda: all(map(Path.exists, began)))
+    assert raylets.same_rows(tmp_path / "alone", tmp_path / "ray")
+    assert not raylets.same_rows(tmp_path / "alone", tmp_path / "none")
+    stages = raylets.stages(project, "pair", "tiny", tmp_path / "alone")
+    assert len(stages) > 6
+    assert 0.0 < raylets.simulated(stages) < sum(records.read(stage).seconds for stage in stages)

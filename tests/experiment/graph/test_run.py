@@ -135,6 +135,21 @@ def test_a_damaged_record_is_an_error(chain: list[Stage]) -> None:
         pending(chain)
 
 
+def test_a_record_that_was_changed_anywhere_is_an_error(chain: list[Stage]) -> None:
+    """It may still be JSON with every key; one without a checksum, of an older version, is believed."""
+    run(chain)
+    record = chain[0].record
+    whole = json.loads(record.read_text())
+    record.write_text(json.dumps({**whole, "facts": {"steps": 8}}))
+    with pytest.raises(RomnavError, match=r"a/record\.json: damaged record \(its content .* sha256 .*\); restore it"):
+        pending(chain)
+    record.write_text(json.dumps(whole))  # laid out in another way
+    assert pending(chain) == []
+    del whole["sha256"]
+    record.write_text(json.dumps(whole))
+    assert pending(chain) == []
+
+
 def test_stages_run_again_on_request_with_those_that_need_them(tmp_path: Path) -> None:
     a = stage(tmp_path, "a", Settings())
     b = stage(tmp_path, "b", Settings(), (a,))

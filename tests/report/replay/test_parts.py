@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from romnav.report.paired.gallery import EpisodeGallery
-from romnav.report.replay.parts import Figure, parts, storeys
+from romnav.report.replay.parts import Figure, Motion, parts, storeys
 from romnav.robot.spec import RobotSpec
 from romnav.world.mesh import triangulate
 
@@ -35,3 +35,18 @@ def test_meshes_of_the_humanoid_are_where_its_bodies_are() -> None:
     assert np.linalg.norm(at[:, :2] - pelvis[:2], axis=1).max() < 0.6
     assert (at[:, 2] > -0.1).all()
     assert (at[:, 2] < 1.5).all()
+
+
+def test_between_its_samples_the_humanoid_moves_smoothly_and_the_short_way_around() -> None:
+    time = np.arange(20) * 0.2
+    turn = 1.2 * time
+    joints = np.zeros((20, 8))
+    joints[:, 3], joints[:, 6] = np.cos(turn / 2), np.sin(turn / 2)
+    joints[:, 7] = 0.4 * np.sin(2 * np.pi * time / 0.8)
+    joints[::3, 3:7] *= -1  # the same orientations
+    motion = Motion(joints)
+    for at in np.linspace(2, 17, 40):
+        between = motion(at)
+        heading = 2 * np.arctan2(between[6], between[3])
+        assert abs(np.angle(np.exp(1j * (heading - 1.2 * 0.2 * at)))) < 1e-3
+        assert abs(between[7] - 0.4 * np.sin(2 * np.pi * 0.2 * at / 0.8)) < 0.06

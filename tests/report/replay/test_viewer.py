@@ -8,6 +8,7 @@ import pytest
 
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.replay import replay
+from romnav.evaluation.postures import Postures
 from romnav.evaluation.rollout import Oracle
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.navigation.spec import EnvSpec
@@ -45,6 +46,30 @@ def test_robots_stand_where_their_tracks_are_and_stay_where_they_end(viewer: Vie
             way = gallery.tracks.position[gallery.tracks.of(3)]
             expected = way[min(step, len(way) - 1)] + [0, 0, HEIGHT / 2]
             np.testing.assert_allclose(viewer._bodies[name].position, expected, atol=1e-5)
+
+
+def test_a_humanoid_walks_with_its_meshes_as_it_was_recorded(
+    viewer: Viewer, galleries: dict[str, EpisodeGallery]
+) -> None:
+    gallery = viewer._galleries["oracle"]
+    joints = np.zeros((len(gallery.tracks.position), 22))
+    joints[:, :3] = gallery.tracks.position + np.array([0, 0, 0.75])
+    joints[:, 3] = 1.0
+    gallery.postures = Postures(joints, np.zeros((len(joints), 8), np.float32))
+    viewer._open(3)
+    try:
+        meshes, way = viewer._joints["oracle"], gallery.tracks.position[gallery.tracks.of(3)]
+        assert "straight" not in viewer._joints
+        for step in (0, 7):
+            viewer._show(step)
+            at = np.array([mesh.position for mesh in meshes]) - way[min(step, len(way) - 1)]
+            assert np.hypot(at[:, 0], at[:, 1]).max() < 0.6
+            assert -0.1 < at[:, 2].min() < at[:, 2].max() < 1.5
+            assert not viewer._bodies["oracle"].visible
+    finally:
+        gallery.postures = None
+        viewer._open(3)
+    assert viewer._joints == {}
 
 
 def test_storeys_above_those_to_show_are_hidden(viewer: Viewer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,10 @@ from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIR
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
-from romnav.robot.spec import LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
+from romnav.robot.spec import LaterMixSpec, LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
+from tests.test_journal import told
 
 SHARES = {"flat": 0.5, "stairs": 0.5}
 SPEC = LocomotionSpec(
@@ -116,7 +118,12 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
     for key, value in a["ppo"]["actor_state_dict"].items():
         assert torch.equal(value, b["ppo"]["actor_state_dict"][key]), key
     assert np.array_equal(a["env"]["robots"]["qpos"], b["env"]["robots"]["qpos"])
-    assert len((tmp_path / "parts" / "curve.csv").read_text().splitlines()) == 3
+    with (tmp_path / "parts" / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    seen = told(tmp_path / "parts")
+    for tag, column in {"run/reward": "reward", "loss/value": "value", "run/fell": "fell"}.items():
+        assert seen[tag] == [(int(row["steps"]), pytest.approx(float(row[column]), rel=1e-4)) for row in rows]
+    assert len(rows) == 2
     spec, policy, iteration = load_policy(parts)
     assert spec == SPEC
     assert iteration == 2
@@ -148,12 +155,17 @@ def test_rows_behind_the_checkpoint_are_not_there_twice(tmp_path: Path) -> None:
 
 
 def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Path) -> None:
-    """Across the iteration at which they join, from a checkpoint of the specification without them, and after it."""
+    """Across the iteration at which they join, from a checkpoint of the specification without them, and across that at
+    which they are asked for something else, from one of the specification without that."""
     world = WorldSpec(tiles=2, goals_per_tile=4, classes=("building", "outdoor"))
-    spec = SPEC.model_copy(update={"tiles": TileTaskSpec(robots=4, begin=1, world=world), "iterations": 3})
+    joined = TileTaskSpec(robots=4, begin=1, world=world)
+    drivers = {"steps": 1.0, "smooth": 0.0, "oracle": 0.0}
+    tiles = joined.model_copy(update={"later": LaterMixSpec(begin=2, drivers=drivers, hold=(0.2, 0.2))})
+    spec = SPEC.model_copy(update={"tiles": tiles, "iterations": 3})
     whole = train(spec, tmp_path / "whole", threads=1, worlds=tmp_path)
     train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
-    train(spec.model_copy(update={"iterations": 2}), tmp_path / "parts", threads=1, worlds=tmp_path)
+    before = SPEC.model_copy(update={"tiles": joined, "iterations": 2})
+    train(before, tmp_path / "parts", threads=1, worlds=tmp_path)
     parts = train(spec, tmp_path / "parts", threads=2, worlds=tmp_path)
     a, b = (KIND.load(path) for path in (whole, parts))
     for key, value in a["ppo"]["actor_state_dict"].items():
@@ -165,8 +177,24 @@ def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Pat
     assert len(lines) == 4
     assert len({len(line) for line in lines}) == 1
     assert spec.steps(3) == 6 * (3 * 8 + 2 * 4)
-    with pytest.raises(RomnavError, match="another specification"):
-        train(SPEC.model_copy(update={"iterations": 4}), tmp_path / "parts", threads=1)
+    for other in (SPEC, before):
+        with pytest.raises(RomnavError, match="another specification"):
+            train(other.model_copy(update={"iterations": 4}), tmp_path / "parts", threads=1)
+
+
+def test_what_robots_on_tiles_are_asked_for_changes_where_it_is_said(tmp_path: Path) -> None:
+    world = build(WorldSpec(tiles=2, goals_per_tile=4, classes=("building", "outdoor")), tmp_path)
+    drawn, led = {"steps": 1.0, "smooth": 0.0, "oracle": 0.0}, {"steps": 0.0, "smooth": 0.0, "oracle": 1.0}
+    tiles = TileTaskSpec(robots=8, begin=3, drivers=drawn, later=LaterMixSpec(begin=5, drivers=led))
+    assert [tiles.mix(k).drivers["oracle"] for k in (1, 5, 6)] == [0.0, 0.0, 1.0]
+    env = TileEnv(SPEC.model_copy(update={"tiles": tiles}), world, threads=1)
+    assert not env._named("oracle").any()
+    env.ask(tiles.mix(6))
+    assert not env._named("oracle").any(), "episodes end as they have begun"
+    env._place(torch.arange(8))
+    assert env._named("oracle").all()
+    with pytest.raises(ValueError, match=r"later\.begin: 3 is not after the robots join at 3"):
+        TileTaskSpec(robots=8, begin=3, later=LaterMixSpec(begin=3))
 
 
 def test_commands_on_tiles_are_held_and_within_the_limits(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The learning curve while it grows, for TensorBoard; and for Weights & Biases where its project is named."""
+"""A learning curve while it grows, for TensorBoard; and for Weights & Biases where its project is named."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ EVENTS = "events.out.tfevents.*"
 
 
 class Journal:
-    """Writes rows of ``curve.csv`` as TensorBoard's events beside it, by environment steps.
+    """Writes rows of ``curve.csv`` as TensorBoard's events beside it, by steps: of environments, or of the gradient.
 
     Args:
         folder: Of the run.
-        steps: Environment steps that are done: what an interrupted session wrote beyond them is passed over.
+        steps: Steps that are done: what an interrupted session wrote beyond them is passed over.
 
     Raises:
         RomnavError: W&B is asked for, but not installed.
@@ -40,11 +40,11 @@ class Journal:
 
             self._writer = SummaryWriter(str(folder), purge_step=steps + 1)
 
-    def add(self, row: Mapping[str, float]) -> None:
+    def add(self, steps: int, row: Mapping[str, float]) -> None:
         """A row; what is not a number in it, as success before an episode ended, is left out."""
         for name, value in row.items():
             if name != "steps" and math.isfinite(value):
-                self._writer.add_scalar(_tag(name), value, int(row["steps"]))
+                self._writer.add_scalar(_tag(name), value, steps)
 
     def flush(self) -> None:
         """Bring all rows so far to the disk."""
@@ -59,8 +59,10 @@ class Journal:
 
 def _tag(name: str) -> str:
     group, _, rest = name.partition("_")
-    if group in GROUPS:
+    if group in GROUPS and rest:
         return f"{group}/{rest}"
+    if "/" in name:
+        return name
     return SUCCESS.get(name) or f"run/{name}"
 
 

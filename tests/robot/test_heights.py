@@ -1,4 +1,4 @@
-"""Tiles under the humanoid: geoms and heights against each other."""
+"""Heights of tiles against the geoms, and against the maps as they are drawn."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from romnav.robot.heights import CELL, NOWHERE, TileHeights, surfaces
 from romnav.robot.statics import OBSTACLES
-from romnav.robot.tiles import CELL, TileHeights, geoms
+from romnav.robot.tiles import geoms
 from romnav.world.spec import WorldSpec
 from romnav.world.tile import Tile
 from romnav.world.tiles import generate
@@ -56,3 +57,30 @@ def test_the_reach_chooses_the_storey(tiles: list[Tile]) -> None:
     assert (low <= 0.5).all()
     assert (high[high > 0.5] > low[high > 0.5]).all()
     assert (high > 3.0).any()
+
+
+def test_the_kept_blocks_are_the_whole_map(tiles: list[Tile]) -> None:
+    """Looked up in the maps as they are drawn, layer by layer, without blocks."""
+    generator = torch.Generator().manual_seed(0)
+    tile = torch.arange(60) % 3
+    heights = TileHeights(tuple(tiles))
+    heights.place(tile[tile != 1])
+    heights.place(tile)
+    points = torch.rand(60, 50, 2, generator=generator) * (tiles[0].side + 1.0) - 0.5
+    reach = torch.rand(60, 1, generator=generator) * 8.0
+    found = heights(points, reach)
+    maps = [surfaces(each) for each in tiles]
+    cells = (points / CELL).floor().long().clamp(0, maps[0].shape[1] - 1).numpy()
+    for robot, at in enumerate(cells):
+        layers = maps[tile[robot]][:, at[:, 0], at[:, 1]]
+        metres = layers.astype(np.float32) / 1000
+        below = np.where((layers != NOWHERE) & (metres <= reach[robot].numpy()), metres, -np.inf).max(0)
+        np.testing.assert_array_equal(found[robot], np.where(np.isfinite(below), below, 0.0))
+    assert heights._blocks.nbytes < 0.1 * sum(each.nbytes for each in maps)
+
+
+def test_nowhere_is_the_ground(tiles: list[Tile]) -> None:
+    heights = TileHeights(tuple(tiles))
+    heights.place(torch.zeros(3, dtype=torch.long))
+    points = torch.tensor([[torch.nan, 1.0], [torch.inf, 1.0], [-1e30, 1e30]])
+    assert heights(points, torch.full((3,), 99.0)).isfinite().all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +12,7 @@ from rsl_rl.utils import wandb_log_writer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from romnav.errors import RomnavError
-from romnav.navigation.journal import EVENTS, Journal
-from romnav.navigation.spec import NavigationSpec
-from romnav.navigation.train import train
-from romnav.world.world import World
+from romnav.journal import EVENTS, Journal
 
 
 def told(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -36,30 +32,15 @@ def row(steps: int, **more: float) -> dict[str, float]:
     }
 
 
-def test_a_training_tells_its_curve(world: World, perception: Any, spec: NavigationSpec, tmp_path: Path) -> None:
-    train(spec, world, perception, tmp_path, 0)
-    with (tmp_path / "curve.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    seen = told(tmp_path)
-    for tag, column in {
-        "reward/collision": "reward_collision",
-        "loss/value": "loss_value",
-        "run/seconds": "seconds",
-    }.items():
-        curve = [(int(r["steps"]), float(r[column])) for r in rows]
-        assert [step for step, _ in seen[tag]] == [step for step, _ in curve]
-        assert [value for _, value in seen[tag]] == pytest.approx([value for _, value in curve], rel=1e-4)
-
-
 def test_a_resumed_run_is_told_once(tmp_path: Path) -> None:
     """What was written beyond the checkpoint is passed over, what came before it stays."""
     first = Journal(tmp_path, 0)
     for steps in (10, 20, 30):
-        first.add(row(steps))
+        first.add(steps, row(steps))
     first.close()
     second = Journal(tmp_path, 10)
     for steps in (20, 30, 40):
-        second.add(row(steps, success=0.75))
+        second.add(steps, row(steps, success=0.75))
     second.close()
     assert told(tmp_path)["success/all"] == [(10, 0.5), (20, 0.75), (30, 0.75), (40, 0.75)]
 
@@ -67,7 +48,7 @@ def test_a_resumed_run_is_told_once(tmp_path: Path) -> None:
 def test_a_run_that_starts_over_tells_nothing_of_the_old_one(tmp_path: Path) -> None:
     for value in (0.5, 0.75):
         journal = Journal(tmp_path, 0)
-        journal.add(row(10, success=value))
+        journal.add(10, row(10, success=value))
         journal.close()
     assert len(list(tmp_path.glob(EVENTS))) == 1
     assert told(tmp_path)["success/all"] == [(10, 0.75)]
@@ -75,7 +56,7 @@ def test_a_run_that_starts_over_tells_nothing_of_the_old_one(tmp_path: Path) -> 
 
 def test_what_is_no_number_is_left_out(tmp_path: Path) -> None:
     journal = Journal(tmp_path, 0)
-    journal.add(row(10, success=math.nan))
+    journal.add(10, row(10, success=math.nan))
     journal.close()
     seen = told(tmp_path)
     assert "success/all" not in seen
@@ -108,7 +89,7 @@ def test_weights_and_biases_are_told_where_their_project_is_named(
     monkeypatch.setenv("WANDB_PROJECT", "stairs")
     folder = tmp_path / "cpu" / "rom" / "seed-0"
     journal = Journal(folder, 0)
-    journal.add(row(10))
+    journal.add(10, row(10))
     journal.close()
     assert (fake.project, fake.run.name, fake.finished) == ("stairs", "cpu/rom/seed-0", True)
     assert (10, {"reward/position": 0.25}) in fake.logged
