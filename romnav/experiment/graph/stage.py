@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
@@ -92,7 +93,7 @@ class Stage:
         plain = {name: _plain(self.settings, name) for name in self.uses}
         if self.code:
             plain["code"] = self.code
-        read = {path.name: digest(path) if path.exists() else None for path in self.reads}
+        read = {name: digest(path) if path.exists() else None for name, path in _named(self.reads).items()}
         # through JSON, as the record is: a tuple there is a list
         data: dict[str, Any] = json.loads(json.dumps({"arm": self.arm, "seed": self.seed, **plain, **read}))
         return data
@@ -102,6 +103,15 @@ class Stage:
         """Hash of the specification and of every upstream key."""
         text = json.dumps([self.kind, self.spec, [stage.key for stage in self.upstream]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _named(paths: Sequence[Path]) -> dict[str, Path]:
+    """Files by their names, or from the folder that they share on where two are called alike."""
+    named = {path.name: path for path in paths}
+    if len(named) == len(paths):
+        return named
+    shared = os.path.commonpath(paths)
+    return {path.relative_to(shared).as_posix(): path for path in paths}
 
 
 def _plain(settings: Config, name: str) -> Any:
