@@ -56,7 +56,8 @@ def test_tables_are_made_of_rows_alone(evaluated: Path) -> None:
     assert result.exit_code == 0
     assert "UniformNoCap" in result.stdout
     folder = evaluated / "results" / "smoke" / "tables"
-    names = [f"spawngoal-{kind}-rom.{end}" for kind in ("perf", "levels", "success") for end in ("tex", "md", "csv")]
+    kinds = ("perf", "levels", "success", "failures")
+    names = [f"spawngoal-{kind}-rom.{end}" for kind in kinds for end in ("tex", "md", "csv")]
     assert sorted(p.name for p in folder.iterdir()) == sorted([*names, "spawn-goal.json"])
     before = {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix != ".json"}
     assert romnav("tables").exit_code == 0

@@ -55,7 +55,7 @@ def test_every_arm_says_in_its_key_what_code_it_runs(work: Workspace) -> None:
         assert "examples." in str(stage.spec[section])
     driven = kinds.episodes(work, "wall-follower", 0)
     assert driven.upstream == ()
-    assert driven.spec["code"][0].startswith("examples.wall_follower:WallFollower@")
+    assert driven.spec["code"][-1].startswith("examples.wall_follower:WallFollower@")
     assert "@" in kinds.episodes(work, "unicycle", 0).upstream[-1].spec["navigation"]["dynamics"]
 
 
