@@ -261,9 +261,10 @@ def inflate(occupied: torch.Tensor, radius: float) -> torch.Tensor:
     """
     if occupied.ndim != 3 or occupied.dtype != torch.bool:
         raise RomnavError(f"occupancy is {occupied.dtype} {tuple(occupied.shape)}; expected bool (B, rows, columns)")
-    reach = int(radius)
-    # Least squares of integers against the square of the radius: no rounding at the disc's rim.
-    widths = [math.isqrt(int(radius * radius + 1e-9) - k * k) for k in range(reach + 1)]
+    # Squares of integers against the square of the radius: no rounding at the disc's rim.
+    square = int(radius * radius + 1e-9)
+    reach = math.isqrt(square)
+    widths = [math.isqrt(square - k * k) for k in range(reach + 1)]
     device = str(occupied.device)
     distance = torch.empty(occupied.shape, dtype=torch.int32, device=device)
     inflated = torch.zeros(occupied.shape, dtype=torch.bool, device=device)
