@@ -9,20 +9,16 @@ import torch
 from torch import Tensor
 
 from romnav.robot.g1 import JOINTS, Robots
+from romnav.robot.heights import Heights
 from romnav.robot.locomotion.legs import Legs
-from romnav.robot.locomotion.lip import Reference, Walker, turn_xy, wrap
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, reflect
-from romnav.robot.locomotion.terrain import Heights
+from romnav.robot.locomotion.planar import heading_of, turn_xy, wrap
+from romnav.robot.locomotion.walker import Reference, Walker
 from romnav.robot.spec import LocomotionSpec
 
 SCAN = tuple((x, y) for y in (-0.15, 0.15) for x in np.linspace(-0.4, 1.0, 15))
 """Height scan ahead of and beside the pelvis in the heading frame, m."""
 TARGETS = len(JOINTS)
-
-
-def heading_of(orientation: Tensor) -> Tensor:
-    """Yaw (n,) of rotations (n, 3, 3)."""
-    return torch.atan2(orientation[:, 1, 0], orientation[:, 0, 0])
 
 
 def has_fallen(robots: Robots) -> Tensor:
@@ -57,8 +53,8 @@ class Controller:
         lift = position + torch.tensor([0.0, 0.0, gait.pelvis + 0.003])
         qpos = torch.cat([lift, half, self._rest.expand(k, -1)], dim=1)
         side = torch.where(clock < gait.step_ticks, 1.0, -1.0)
-        w = self.walker.w
-        sway = side * gait.width / 2 * w * np.tanh(w * self.walker.duration / 2)
+        w, duration = self.walker.gait.w, self.walker.gait.duration
+        sway = side * gait.width / 2 * w * np.tanh(w * duration / 2)
         start = 0.5 * command[:, :2].clamp(-0.5, 0.5)
         velocity = start + torch.stack([torch.zeros(k), sway], dim=1)
         qvel = torch.zeros(k, 6 + TARGETS)
@@ -69,7 +65,7 @@ class Controller:
 
     def refer(self, command: Tensor, ground: Heights, first: Tensor) -> Reference:
         """Reference of this control step, (n,) `first` for robots just placed."""
-        self.reference = self.walker.update(self.robots, command, ground, first=first)
+        self.reference = self.walker.update(self.robots, command, ground, first)
         return self.reference
 
     def act(self, action: Tensor, ids: Tensor | None = None) -> None:
@@ -139,7 +135,7 @@ class Controller:
         """That of robots `ids` (k,) alone, which are `robots` now."""
         part = Controller(self.spec, robots)
         for name in Walker.STATE:
-            setattr(part.walker, name, getattr(self.walker, name)[ids])
+            getattr(part.walker, name).copy_(getattr(self.walker, name)[ids])
         part.action = self.action[ids]
         return part
 
@@ -152,5 +148,5 @@ class Controller:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name in Walker.STATE:
-            setattr(self.walker, name, state[name].clone())
+            getattr(self.walker, name).copy_(state[name])
         self.action, self.reference = state["action"].clone(), Reference(**state["reference"])

@@ -10,11 +10,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.robot.g1 import Humanoids, Robots
+from romnav.robot.heights import Heights
 from romnav.robot.locomotion.clf import Clf
-from romnav.robot.locomotion.control import TARGETS, Controller, has_fallen, heading_of
-from romnav.robot.locomotion.lip import Reference, turn_xy, wrap
+from romnav.robot.locomotion.control import TARGETS, Controller, has_fallen
 from romnav.robot.locomotion.mirror import PRIVILEGED_MIRROR, reflect
-from romnav.robot.locomotion.terrain import Heights
+from romnav.robot.locomotion.planar import heading_of, turn_xy, wrap
+from romnav.robot.locomotion.walker import Reference
 from romnav.robot.spec import LocomotionSpec
 
 

@@ -12,8 +12,8 @@ import torch
 from romnav.errors import RomnavError
 from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
 from romnav.robot.locomotion.lane_task import LocomotionEnv
-from romnav.robot.locomotion.lip import turn_xy
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR
+from romnav.robot.locomotion.planar import turn_xy
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
