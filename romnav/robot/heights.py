@@ -111,7 +111,7 @@ class Heights:
         self.maps = Maps()
 
     def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
-        """Height (n, ...), m, of the highest surface not above `reach` under points (n, ..., 2); 0 where there is none."""
+        """Height (n, ...), m, of the highest surface not above `reach` under points (n, ..., 2), or 0."""
         shape = points.shape[:-1]
         heights = torch.empty(len(points), shape[1:].numel())
         at = points.reshape(*heights.shape, 2).contiguous()

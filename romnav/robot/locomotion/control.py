@@ -43,6 +43,11 @@ class Controller:
         self._scan = torch.tensor(SCAN, dtype=torch.float32)
         self._rest = torch.cat([self.walker.stance().reshape(12), torch.zeros(3)])
 
+    @property
+    def reference(self) -> Reference:
+        """That of this control step."""
+        return self.walker.reference
+
     def stand(self, ids: Tensor, position: Tensor, heading: Tensor, clock: Tensor, command: Tensor) -> None:
         """Put robots `ids` on their feet at `position` (k, 3) (the ground's height), beginning a step.
 
@@ -65,8 +70,7 @@ class Controller:
 
     def refer(self, command: Tensor, ground: Heights, first: Tensor) -> Reference:
         """Reference of this control step, (n,) `first` for robots just placed."""
-        self.reference = self.walker.update(self.robots, command, ground, first)
-        return self.reference
+        return self.walker.update(self.robots, command, ground, first)
 
     def act(self, action: Tensor, ids: Tensor | None = None) -> None:
         """Step robots with residual actions (n, 15) as seen in the mirror of `observe`; all, or only `ids`."""
@@ -142,11 +146,14 @@ class Controller:
     def state_dict(self) -> dict[str, Any]:
         """State besides the robots'."""
         return {name: getattr(self.walker, name).clone() for name in Walker.STATE} | {
-            "action": self.action.clone(), "reference": dict(vars(self.reference)),
+            "action": self.action.clone(),
+            "reference": {name: value.clone() for name, value in vars(self.reference).items()},
         }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name in Walker.STATE:
             getattr(self.walker, name).copy_(state[name])
-        self.action, self.reference = state["action"].clone(), Reference(**state["reference"])
+        for name, value in state["reference"].items():
+            getattr(self.reference, name).copy_(value)
+        self.action = state["action"].clone()

@@ -45,6 +45,26 @@ class State:
     integral: wp.array(dtype=wp.vec2)
 
 
+@wp.struct
+class Targets:
+    """A `romnav.robot.locomotion.walker.Reference` but for its joints, and the poses of the ankles in the frame of the
+    pelvis that those are for."""
+
+    side: wp.array(dtype=float)
+    phase: wp.array(dtype=float)
+    torque: wp.array3d(dtype=float)
+    com: wp.array(dtype=wp.vec2)
+    com_velocity: wp.array(dtype=wp.vec2)
+    height: wp.array(dtype=float)
+    heading: wp.array(dtype=float)
+    swing: wp.array(dtype=wp.vec3)
+    foothold: wp.array(dtype=wp.vec3)
+    sole: wp.array2d(dtype=wp.vec3)
+    ground: wp.array(dtype=float)
+    ankle: wp.array2d(dtype=wp.vec3)
+    ankle_rotation: wp.array2d(dtype=wp.mat33)
+
+
 @wp.func
 def _xy(vector: wp.vec3):
     return wp.vec2(vector[0], vector[1])
@@ -131,12 +151,20 @@ def lying(maps: Maps, robot: int, centre: wp.vec2, yaw: float, reach: float):
     return _about(_Z, yaw) * _about(_Y, pitch)
 
 
+@wp.func
+def ground_force(gait: Gait, weight: float, lean: wp.vec3):
+    """Force of the ground that holds a share of the weight, N, along the pendulum."""
+    across = wp.vec2(wp.clamp(lean[0], -0.3, 0.3), wp.clamp(lean[1], -0.3, 0.3)) / gait.pendulum
+    return weight * wp.vec3(across[0], across[1], 1.0)
+
+
 @wp.kernel
 def refer(
     gait: Gait,
     maps: Maps,
     wanted: wp.array(dtype=wp.vec3),
     fresh: wp.array(dtype=wp.bool),
+    mass: float,
     pelvis: wp.array(dtype=wp.vec3),
     body: wp.array(dtype=wp.mat33),
     pelvis_velocity: wp.array(dtype=wp.vec3),
@@ -144,24 +172,12 @@ def refer(
     com_velocity: wp.array(dtype=wp.vec3),
     ankle: wp.array2d(dtype=wp.vec3),
     ankle_rotation: wp.array2d(dtype=wp.mat33),
+    anchor: wp.array2d(dtype=wp.vec3),
+    axis: wp.array2d(dtype=wp.vec3),
     touch: wp.array2d(dtype=wp.bool),
     feet: wp.vec2i,
-    # changed
     state: State,
-    # of the `Reference`
-    side: wp.array(dtype=float),
-    phase: wp.array(dtype=float),
-    orbit_position: wp.array(dtype=wp.vec2),
-    orbit_rate: wp.array(dtype=wp.vec2),
-    height: wp.array(dtype=float),
-    heading: wp.array(dtype=float),
-    swing: wp.array(dtype=wp.vec3),
-    foothold: wp.array(dtype=wp.vec3),
-    sole: wp.array2d(dtype=wp.vec3),
-    ground: wp.array(dtype=float),
-    # ankles wanted, in the frame of the pelvis
-    position: wp.array2d(dtype=wp.vec3),
-    turn: wp.array2d(dtype=wp.mat33),
+    targets: Targets,
 ):
     robot = wp.tid()
     slew = gait.acceleration * gait.dt
@@ -182,20 +198,20 @@ def refer(
     facing = wrap(yaw + wp.clamp(wrap(state.heading[robot] + command[2] * gait.dt - yaw), -0.35, 0.35))
     state.heading[robot] = facing
     for i in range(2):
-        sole[robot, i] = ankle[robot, i] + ankle_rotation[robot, i] * _SOLE
+        targets.sole[robot, i] = ankle[robot, i] + ankle_rotation[robot, i] * _SOLE
 
     # A foot that is late keeps aiming at its foothold until it touches the ground.
     landed = touch[robot, feet[stance]] or fresh[robot]
     if start:
-        state.planted[robot] = sole[robot, stance] if fresh[robot] else state.foothold[robot]
-        state.lift[robot] = sole[robot, 1 - stance]
+        state.planted[robot] = targets.sole[robot, stance] if fresh[robot] else state.foothold[robot]
+        state.lift[robot] = targets.sole[robot, 1 - stance]
     elif state.landed[robot]:
         landed = True
     state.landed[robot] = landed
-    stand = sole[robot, stance] if landed else state.planted[robot]
+    stand = targets.sole[robot, stance] if landed else state.planted[robot]
     reach = stand[2] + 0.5
-    under = highest(maps, robot, _xy(sole[robot, stance]), reach)
-    under_swing = highest(maps, robot, _xy(sole[robot, 1 - stance]), reach)
+    under = highest(maps, robot, _xy(targets.sole[robot, stance]), reach)
+    under_swing = highest(maps, robot, _xy(targets.sole[robot, 1 - stance]), reach)
     mean = (under + under_swing) / 2.0
     if start:
         state.base[robot] = mean
@@ -247,46 +263,29 @@ def refer(
             lies = lying(maps, robot, _xy(stand), _yaw(ankle_rotation[robot, i]), reach)
             frame = wp.transpose(_about(_Z, facing) * _about(_Y, upright[0]) * _about(_X, -upright[1]))
             hip = wp.vec3(is_at[0] + pull[0], is_at[1] + pull[1], tall)
-            position[robot, i] = frame * (stand - lies * _SOLE - hip)
-            turn[robot, i] = frame * lies
+            targets.ankle[robot, i] = frame * (stand - lies * _SOLE - hip)
+            targets.ankle_rotation[robot, i] = frame * lies
         else:
             lies = lying(maps, robot, _xy(place), landing, reach)
             frame = wp.transpose(rotation)
-            position[robot, i] = frame * (foot - lies * _SOLE - is_at)
-            turn[robot, i] = frame * lies
+            targets.ankle[robot, i] = frame * (foot - lies * _SOLE - is_at)
+            targets.ankle_rotation[robot, i] = frame * lies
 
-    side[robot] = on
-    phase[robot] = done
-    orbit_position[robot] = at
-    orbit_rate[robot] = moving
-    height[robot] = tall
-    heading[robot] = facing
-    swing[robot] = foot
-    foothold[robot] = place
-    ground[robot] = mean
+    # Weight: the pendulum's ground force, which moves onto the stance foot within the first fifth of the step.
+    share = wp.min(0.5 + 2.5 * done, 1.0)
+    for i in range(2):
+        weight = mass * GRAVITY * (share if i == stance else 1.0 - share)
+        force = ground_force(gait, weight, com[robot] - targets.sole[robot, i])
+        for k in range(6):
+            arm = targets.sole[robot, i] - anchor[robot, 6 * i + k]
+            targets.torque[robot, i, k] = -wp.dot(axis[robot, 6 * i + k], wp.cross(arm, force))
 
-
-@wp.kernel
-def carry(
-    gait: Gait,
-    mass: float,
-    com: wp.array(dtype=wp.vec3),
-    sole: wp.array2d(dtype=wp.vec3),
-    anchor: wp.array2d(dtype=wp.vec3),
-    axis: wp.array2d(dtype=wp.vec3),
-    side: wp.array(dtype=float),
-    phase: wp.array(dtype=float),
-    torque: wp.array3d(dtype=float),
-):
-    """Joint torques that hold the pendulum's ground force, shared between the feet while the weight shifts, N m."""
-    robot, i = wp.tid()
-    share = wp.min(0.5 + 2.5 * phase[robot], 1.0)
-    if (side[robot] > 0.0) == (i == 1):
-        share = 1.0 - share
-    foot = sole[robot, i]
-    lean = com[robot] - foot
-    across = wp.vec2(wp.clamp(lean[0], -0.3, 0.3), wp.clamp(lean[1], -0.3, 0.3)) / gait.pendulum
-    force = mass * GRAVITY * share * wp.vec3(across[0], across[1], 1.0)
-    for k in range(6):
-        joint = 6 * i + k
-        torque[robot, i, k] = -wp.dot(axis[robot, joint], wp.cross(foot - anchor[robot, joint], force))
+    targets.side[robot] = on
+    targets.phase[robot] = done
+    targets.com[robot] = at
+    targets.com_velocity[robot] = moving
+    targets.height[robot] = tall
+    targets.heading[robot] = facing
+    targets.swing[robot] = foot
+    targets.foothold[robot] = place
+    targets.ground[robot] = mean

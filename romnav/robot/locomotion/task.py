@@ -164,7 +164,7 @@ class WalkingEnv(VecEnv):
         value = self.clf(error, rates, self._tolerance)
         self._slope = torch.where(begin, -self.clf.decay * value, (value - self.value) / self.dt)
         self.value = value
-        self._last.update(sole=sole, swing=ref.swing, height=ref.height)
+        self._last.update(sole=sole, swing=ref.swing.clone(), height=ref.height.clone())
         self.first = torch.zeros_like(self.first)
 
     def get_observations(self) -> TensorDict:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,11 +15,11 @@ from romnav.robot.g1 import SOLE, Robots
 from romnav.robot.heights import Heights
 from romnav.robot.locomotion.legs import Legs
 from romnav.robot.locomotion.lip import gait_of
-from romnav.robot.locomotion.reference import State, carry, refer
+from romnav.robot.locomotion.reference import State, Targets, refer
 from romnav.robot.spec import GaitSpec
 
-_scalar = partial(wp.from_torch, return_ctype=True)
-_vec2, _vec3, _mat33 = (partial(_scalar, dtype=dtype) for dtype in (wp.vec2, wp.vec3, wp.mat33))
+_plain = partial(wp.from_torch, return_ctype=True)
+_vec2, _vec3, _mat33 = (partial(_plain, dtype=dtype) for dtype in (wp.vec2, wp.vec3, wp.mat33))
 
 
 @dataclass
@@ -58,7 +60,11 @@ class Walker:
     `STATE` names what it remembers of each robot: the clock, where the swing foot left the ground, where it is
     to land, where the stance foot was to land and whether it has, the mean ground height at the start of the
     step, the heading and velocity it follows, the integral of the velocity's error, and the last solution of the
-    inverse kinematics. These tensors are changed in place.
+    inverse kinematics. These tensors and those of the `reference` are changed in place, every control step.
+
+    Attributes:
+        gait: the specification, for kernels.
+        reference: of the last control step.
     """
 
     STATE = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "integral", "joints")
@@ -76,9 +82,16 @@ class Walker:
         self.command = torch.zeros(count, 3)
         self.integral = torch.zeros(count, 2)
         self.joints = self.stance().expand(count, 2, 6).clone()
-        self._state = State()
-        for name, variable in State.vars.items():
-            setattr(self._state, name, wp.from_torch(getattr(self, name), dtype=variable.type.dtype))
+        n, zeros = count, torch.zeros
+        self._ankle, self._ankle_rotation = zeros(n, 2, 3), zeros(n, 2, 3, 3)
+        self.reference = Reference(
+            side=zeros(n), phase=zeros(n), joints=self.joints, torque=zeros(n, 2, 6), com=zeros(n, 2),
+            com_velocity=zeros(n, 2), height=zeros(n), heading=zeros(n), swing=zeros(n, 3), foothold=zeros(n, 3),
+            sole=zeros(n, 2, 3), ground=zeros(n),
+        )  # fmt: skip
+        self._state = _struct(State, vars(self))
+        ankles = {"ankle": self._ankle, "ankle_rotation": self._ankle_rotation}
+        self._targets = _struct(Targets, vars(self.reference) | ankles)
 
     def stance(self) -> Tensor:
         """Leg joints (1, 2, 6) of standing at the nominal height with the feet apart."""
@@ -104,7 +117,7 @@ class Walker:
         return robots.ankle + robots.ankle_rotation @ torch.tensor(SOLE)
 
     def update(self, robots: Robots, command: Tensor, ground: Heights, first: Tensor) -> Reference:
-        """The reference of this control step.
+        """The reference of this control step, also in `reference` until the next one.
 
         Args:
             robots: their states.
@@ -112,26 +125,20 @@ class Walker:
             ground: walking surfaces.
             first: (n,) robots that were just reset.
         """
-        n, r = len(command), robots
-        side, phase, height, heading, mean = (torch.empty(n) for _ in range(5))
-        com, com_velocity = torch.empty(n, 2), torch.empty(n, 2)
-        swing, foothold = torch.empty(n, 3), torch.empty(n, 3)
-        sole, position = torch.empty(n, 2, 3), torch.empty(n, 2, 3)
-        turn, torque = torch.empty(n, 2, 3, 3), torch.empty(n, 2, 6)
+        r = robots
         inputs = [
-            self.gait, ground.maps, _vec3(command), _scalar(first), _vec3(r.pelvis), _mat33(r.orientation),
+            self.gait, ground.maps, _vec3(command), _plain(first), r.mass, _vec3(r.pelvis), _mat33(r.orientation),
             _vec3(r.velocity), _vec3(r.com), _vec3(r.com_velocity), _vec3(r.ankle), _mat33(r.ankle_rotation),
-            _scalar(r.touch), wp.vec2i(r.feet),
+            _vec3(r.anchor), _vec3(r.axis), _plain(r.touch), wp.vec2i(r.feet),
         ]  # fmt: skip
-        outputs = [
-            self._state, _scalar(side), _scalar(phase), _vec2(com), _vec2(com_velocity), _scalar(height),
-            _scalar(heading), _vec3(swing), _vec3(foothold), _vec3(sole), _scalar(mean), _vec3(position), _mat33(turn),
-        ]  # fmt: skip
-        wp.launch(refer, n, inputs, outputs, device="cpu")
-        inputs = [
-            self.gait, r.mass, _vec3(r.com), _vec3(sole), _vec3(r.anchor), _vec3(r.axis), _scalar(side), _scalar(phase),
-        ]  # fmt: skip
-        wp.launch(carry, (n, 2), inputs, [_scalar(torque)], device="cpu")
-        joints = self.legs.inverse(position, turn, self.joints)
-        self.joints.copy_(joints)
-        return Reference(side, phase, joints, torque, com, com_velocity, height, heading, swing, foothold, sole, mean)
+        wp.launch(refer, len(command), inputs, [self._state, self._targets], device="cpu")
+        self.joints.copy_(self.legs.inverse(self._ankle, self._ankle_rotation, self.joints))
+        return self.reference
+
+
+def _struct(kind: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """A Warp struct of arrays that are tensors."""
+    struct = kind()
+    for name, variable in kind.vars.items():
+        setattr(struct, name, wp.from_torch(tensors[name], dtype=variable.type.dtype))
+    return struct
