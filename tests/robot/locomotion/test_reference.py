@@ -110,6 +110,7 @@ def test_control_steps_are_as_written_out() -> None:
                 )
         control.act(torch.zeros(count, 15))
     for name, errors in worst.items():
-        assert np.mean(np.array(errors) > 1e-4) < 0.01, name
+        # single precision, 60 m from the origin: micrometres, of an arm on which the weight is
+        assert np.mean(np.array(errors) > (5e-3 if name == "torque" else 1e-4)) < 0.01, name
     assert set(worst) == set(Walker.STATE[:-1]) | set(targets) - {"joints"}
     assert (control.reference.foothold[:, 2] > 0.1).any()
