@@ -212,9 +212,6 @@ class Walker:
         """
         s = self.spec
         rows = torch.arange(len(command))
-        slew = torch.tensor(s.acceleration) * self.dt
-        self.command = self.command + torch.maximum(torch.minimum(command - self.command, slew), -slew)
-        turn = self.command[:, 2]
         tick = self.clock % s.step_ticks
         stance_left = (self.clock // s.step_ticks) % 2 == 0
         side = torch.where(stance_left, 1.0, -1.0)
@@ -223,9 +220,6 @@ class Walker:
         fresh = torch.zeros_like(tick, dtype=torch.bool) if first is None else first
         start = (tick == 0) | fresh
 
-        yaw = torch.atan2(robots.orientation[:, 1, 0], robots.orientation[:, 0, 0])
-        lead = wrap(self.heading + turn * self.dt - yaw).clamp(-0.35, 0.35)
-        self.heading = wrap(yaw + lead)
         sole = self.soles(robots)
         # A foot that is late keeps aiming at its foothold until it touches the ground.
         self.planted = torch.where(
@@ -241,13 +235,25 @@ class Walker:
         self.base = torch.where(start, mean, self.base)
         self.lift = torch.where(start[:, None], swinging, self.lift)
 
-        # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
-        # but not on stairs, where treads bound the steps and the integral would wind up. There, who loses its speed
-        # steps back down to regain it, and falls: it aims at a little more.
-        error = self.command[:, :2] - turn_xy(robots.com_velocity[:, :2], -yaw)
+        yaw = torch.atan2(robots.orientation[:, 1, 0], robots.orientation[:, 0, 0])
+        velocity = turn_xy(robots.com_velocity[:, :2], -yaw)
         apart = torch.maximum((self.foothold[:, 2] - self.base).abs(), (under[:, 0] - under[:, 1]).abs())
         level = (apart < s.level) | fresh
-        self.integral = integrate(self.integral, error, level, s, self.dt)
+        # Who is held by a wall would lean into it ever more.
+        fastest = torch.where(level, velocity[:, 0].clamp(min=0.0) + s.ahead, torch.inf)
+        held = command[:, 0] > fastest
+        wanted = torch.cat([torch.minimum(command[:, 0], fastest)[:, None], command[:, 1:]], dim=1)
+        slew = torch.tensor(s.acceleration) * self.dt
+        self.command = self.command + torch.maximum(torch.minimum(wanted - self.command, slew), -slew)
+        turn = self.command[:, 2]
+        lead = wrap(self.heading + turn * self.dt - yaw).clamp(-0.35, 0.35)
+        self.heading = wrap(yaw + lead)
+
+        # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
+        # but not where the integral would wind up: held by a wall, and on stairs, where treads bound the steps. There,
+        # who loses its speed steps back down to regain it, and falls: it aims at a little more.
+        error = self.command[:, :2] - velocity
+        self.integral = integrate(self.integral, error, level & ~held, s, self.dt)
         speed = orbit_velocity(self.command[:, :2], self.integral, level, s)
 
         # Foothold: the divergent component at touch-down, less the periodic gait's offset, within reach.
