@@ -94,6 +94,8 @@ class GaitSpec(Config):
     """Wanted distance of the sole from a riser before or behind it, m."""
     acceleration: tuple[Positive, Positive, Positive] = (0.8, 0.8, 1.5)
     """Fastest change of the command that the reference follows, m/s^2, m/s^2, rad/s^2."""
+    ahead: Positive = 0.3
+    """On level ground the gait is to go at most this much faster forward than the body goes, m/s."""
     integral_gain: NonNegative = 1.0
     """Of the velocity error into the orbit's velocity, 1/s."""
     integral_limit: NonNegative = 0.5

@@ -44,6 +44,7 @@ class Gait:
     edge_search: float
     edge_margin: float
     acceleration: wp.vec3
+    ahead: float
     integral_gain: float
     integral_limit: float
     level: float
@@ -121,9 +122,9 @@ def capture_offset(gait: Gait, speed: wp.vec2, next_side: float):
 
 
 @wp.func
-def integrate(gait: Gait, integral: wp.vec2, error: wp.vec2, level: bool):
-    """Integral of the velocity error after a control step, m/s; it decays where the ground is not level."""
-    change = gait.integral_gain * error if level else -integral / gait.integral_decay
+def integrate(gait: Gait, integral: wp.vec2, error: wp.vec2, free: bool):
+    """Integral of the velocity error after a control step, m/s; it decays where the robot is not free to go as told."""
+    change = gait.integral_gain * error if free else -integral / gait.integral_decay
     limit = wp.vec2(gait.integral_limit, gait.integral_limit)
     return wp.min(wp.max(integral + gait.dt * change, -limit), limit)
 

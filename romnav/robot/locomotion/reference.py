@@ -180,11 +180,6 @@ def refer(
     targets: Targets,
 ):
     robot = wp.tid()
-    slew = gait.acceleration * gait.dt
-    command = state.command[robot]
-    command += wp.max(wp.min(wanted[robot] - command, slew), -slew)
-    state.command[robot] = command
-
     clock = int(state.clock[robot])
     state.clock[robot] = wp.int64((clock + 1) % (2 * gait.step_ticks))
     tick = clock % gait.step_ticks
@@ -193,10 +188,6 @@ def refer(
     done = float(tick) / float(gait.step_ticks)
     start = tick == 0 or fresh[robot]
 
-    rotation = body[robot]
-    yaw = _yaw(rotation)
-    facing = wrap(yaw + wp.clamp(wrap(state.heading[robot] + command[2] * gait.dt - yaw), -0.35, 0.35))
-    state.heading[robot] = facing
     for i in range(2):
         targets.sole[robot, i] = ankle[robot, i] + ankle_rotation[robot, i] * _SOLE
 
@@ -217,14 +208,29 @@ def refer(
         state.base[robot] = mean
     base = state.base[robot]
 
-    # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
-    # but not on stairs, where treads bound the steps and the integral would wind up. There, who loses its speed
-    # steps back down to regain it, and falls: it aims at a little more.
-    last = state.foothold[robot]
+    rotation = body[robot]
+    yaw = _yaw(rotation)
     rate = _xy(com_velocity[robot])
-    error = _xy(command) - turned(rate, -yaw)
+    velocity = turned(rate, -yaw)
+    last = state.foothold[robot]
     level = wp.max(wp.abs(last[2] - base), wp.abs(under - under_swing)) < gait.level or fresh[robot]
-    integral = integrate(gait, state.integral[robot], error, level)
+    # Who is held by a wall would lean into it ever more.
+    told = wanted[robot]
+    fastest = wp.max(velocity[0], 0.0) + gait.ahead
+    held = level and told[0] > fastest
+    if held:
+        told[0] = fastest
+    slew = gait.acceleration * gait.dt
+    command = state.command[robot]
+    command += wp.max(wp.min(told - command, slew), -slew)
+    state.command[robot] = command
+    facing = wrap(yaw + wp.clamp(wrap(state.heading[robot] + command[2] * gait.dt - yaw), -0.35, 0.35))
+    state.heading[robot] = facing
+
+    # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
+    # but not where the integral would wind up: held by a wall, and on stairs, where treads bound the steps. There,
+    # who loses its speed steps back down to regain it, and falls: it aims at a little more.
+    integral = integrate(gait, state.integral[robot], _xy(command) - velocity, level and not held)
     state.integral[robot] = integral
     speed = orbit_velocity(gait, _xy(command), integral, level)
 

@@ -10,6 +10,9 @@ import pytest
 import torch
 
 from romnav.errors import RomnavError
+from romnav.robot.g1 import Humanoids
+from romnav.robot.heights import HeightMap
+from romnav.robot.locomotion.control import Controller, has_fallen
 from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
 from romnav.robot.locomotion.lane_task import LocomotionEnv
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR
@@ -18,6 +21,7 @@ from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
 from romnav.robot.spec import LaterMixSpec, LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
+from romnav.robot.statics import Geoms
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
 from tests.test_journal import told
@@ -297,3 +301,22 @@ def test_the_test_terrain_is_not_the_training_terrain() -> None:
     assert not shapes(curriculum(np.random.default_rng(1))) & shapes([lane for row in rows() for lane in row.lanes])
     assert {row.terrain for row in rows()} == {"flat", "ramp", "stairs-low", "stairs-high", "u-stair"}
     assert all(len(lane.slabs) >= 39 for row in rows() if row.terrain.startswith("stairs") for lane in row.lanes)
+
+
+@pytest.mark.parametrize("wall", [False, True])
+def test_the_gait_does_not_wind_up_against_a_wall(wall: bool) -> None:
+    spec = LocomotionSpec()
+    upright, half = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.1, 3.0, 1.5]])
+    ahead = Geoms.boxes(np.array([[0.5 if wall else 50.0, 0.0, 1.5]]), half, upright)
+    control = Controller(spec, Humanoids(spec.robot, [ahead], 1, threads=1))
+    command = torch.tensor([[0.8, 0.0, 0.0]])
+    control.stand(torch.arange(1), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, dtype=torch.long), command)
+
+    ground = HeightMap((0.0, 0.0), 1.0, torch.zeros(1, 1))
+    asked = []
+    for tick in range(150):
+        control.refer(command, ground, torch.tensor([tick == 0]))
+        control.act(torch.zeros(1, 15))
+        asked.append(float(control.walker.command[0, 0] + control.walker.integral[0, 0]))
+    assert not has_fallen(control.robots)
+    assert (np.mean(asked[50:]) < 0.6 and max(asked) < 0.8) if wall else np.mean(asked[50:]) > 0.7

@@ -82,13 +82,9 @@ def step(
         The state, and the reference with `ankle` and `ankle_rotation`, the poses wanted in the frame of the pelvis.
     """
     t_step, w = s.step_ticks * dt, np.sqrt(9.81 / s.pendulum)
-    slew = np.array(s.acceleration) * dt
-    command = state["command"] + np.clip(told - state["command"], -slew, slew)
     tick, stance = state["clock"] % s.step_ticks, int(state["clock"] // s.step_ticks % 2)
     swing, side, phase = 1 - stance, 1.0 - 2.0 * stance, tick / s.step_ticks
     start = tick == 0 or fresh
-    yaw = _yaw(robot["orientation"])
-    heading = _wrap(yaw + np.clip(_wrap(state["heading"] + command[2] * dt - yaw), -0.35, 0.35))
     sole = robot["ankle"] + robot["ankle_rotation"] @ SOLE_AT
     planted = state["planted"]
     if start:
@@ -102,9 +98,15 @@ def step(
     lift = sole[swing] if start else state["lift"]
 
     flat = fresh or max(abs(state["foothold"][2] - base), abs(under[0] - under[1])) < s.level
-    rate = robot["com_velocity"][:2]
-    error = command[:2] - _turn(-yaw) @ rate
-    change = s.integral_gain * error if flat else -state["integral"] / s.integral_decay
+    yaw, rate = _yaw(robot["orientation"]), robot["com_velocity"][:2]
+    velocity = _turn(-yaw) @ rate
+    fastest = max(velocity[0], 0.0) + s.ahead if flat else np.inf
+    free = flat and told[0] <= fastest
+    slew = np.array(s.acceleration) * dt
+    command = state["command"] + np.clip(np.minimum(told, [fastest, np.inf, np.inf]) - state["command"], -slew, slew)
+    heading = _wrap(yaw + np.clip(_wrap(state["heading"] + command[2] * dt - yaw), -0.35, 0.35))
+    error = command[:2] - velocity
+    change = s.integral_gain * error if free else -state["integral"] / s.integral_decay
     integral = np.clip(state["integral"] + dt * change, -s.integral_limit, s.integral_limit)
     speed = command[:2] + integral
     if not flat and command[0] > s.stair_speed:
