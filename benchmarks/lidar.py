@@ -188,8 +188,8 @@ def lost(
 ) -> tuple[int, int]:
     """Solids that the `exact` cast of each tile sees within `CLOSE`, summed over poses, and how many ours misses.
 
-    A ray along an edge may fall on either side of it, so a ray counts where those beside it, `HAIR` away along each axis,
-    meet the same solid.
+    A ray along an edge may fall on either side of it, so a ray counts where those beside it, `HAIR` away along each
+    axis, meet the same solid.
     """
     seen = missed = first = 0
     for tile, cast in enumerate(casts):
