@@ -33,7 +33,7 @@ LOCOMOTION = ROOT / "results/cpu/locomotion"
 PARTS = {
     "physics": ("step", "mujoco._batch"),
     "surroundings": ("_surround", "g1.py"),
-    "reference gait, with": ("update", "lip.py"),
+    "reference gait, with": ("update", "walker.py"),
     "heights of the ground": ("__call__", "heights.py"),
     "inverse kinematics": ("inverse", "legs.py"),
     "observation": ("observe", "control.py"),

@@ -1,4 +1,4 @@
-"""Heights of the walking surfaces of tiles, from the solids, under robots that are each on a tile of their own."""
+"""Heights of walking surfaces: maps, and those of tiles, under robots that are each on a tile of their own."""
 
 from __future__ import annotations
 
@@ -47,35 +47,104 @@ def surfaces(tile: Tile, cell: float = CELL) -> NDArray[np.int16]:
     return heights
 
 
-@wp.kernel
-def _highest(
-    blocks: wp.array3d(dtype=float),
-    table: wp.array4d(dtype=wp.int32),
-    tile: wp.array(dtype=wp.int64),
-    cells: int,
-    points: wp.array2d(dtype=wp.vec2),
-    reach: wp.array2d(dtype=float),
-    heights: wp.array2d(dtype=float),
-):
-    robot, k = wp.tid()
+@wp.struct
+class Maps:
+    """Height maps in blocks.
+
+    Attributes:
+        blocks: (blocks, 2^`bits`, 2^`bits`) heights, m, -inf where there is no surface.
+        table: (maps, layers, X, Y) which block is where, -1 where there is no surface.
+        which: (n,) map under each robot; empty where there is one for all.
+        origin, cell, cells: corner, m, side of a cell, m, and number of cells.
+        headroom: surfaces up to this far above a lookup's reach are within it, m.
+    """
+
+    blocks: wp.array3d(dtype=float)
+    table: wp.array4d(dtype=wp.int32)
+    which: wp.array(dtype=wp.int64)
+    origin: wp.vec2
+    cell: float
+    cells: wp.vec2i
+    bits: int
+    headroom: float
+
+
+@wp.func
+def highest(maps: Maps, robot: int, point: wp.vec2, reach: float):
+    """Height of the highest surface not above ``reach`` under a robot's point; 0 where there is none."""
     # what is not finite is nowhere
     at = wp.vec2()
-    if wp.isfinite(points[robot, k]):
-        at = points[robot, k]
-    ix = int(wp.clamp(wp.floor(at[0] / CELL), 0.0, float(cells - 1)))
-    iy = int(wp.clamp(wp.floor(at[1] / CELL), 0.0, float(cells - 1)))
+    if wp.isfinite(point):
+        at = (point - maps.origin) / maps.cell
+    ix = int(wp.clamp(wp.floor(at[0]), 0.0, float(maps.cells[0] - 1)))
+    iy = int(wp.clamp(wp.floor(at[1]), 0.0, float(maps.cells[1] - 1)))
+    which = int(0)  # noqa: RUF046, UP018 - in Warp, int() declares a variable that changes
+    if maps.which.shape[0] > 0:
+        which = int(maps.which[robot])
+    inside = (1 << maps.bits) - 1
     best = float(-wp.inf)
-    for layer in range(table.shape[1]):
-        block = table[int(tile[robot]), layer, ix >> BITS, iy >> BITS]
+    for layer in range(maps.table.shape[1]):
+        block = maps.table[which, layer, ix >> maps.bits, iy >> maps.bits]
         if block >= 0:
-            height = blocks[block, ix & (BLOCK - 1), iy & (BLOCK - 1)]
-            if height <= reach[robot, k]:
+            height = maps.blocks[block, ix & inside, iy & inside]
+            if height <= reach + maps.headroom:
                 best = wp.max(best, height)
-    heights[robot, k] = wp.where(best > -wp.inf, best, 0.0)
+    return wp.where(best > -wp.inf, best, 0.0)
 
 
-class TileHeights:
-    """Walking surfaces under robots that are each on a tile of their own; called like a `HeightMap`.
+@wp.kernel
+def _look_up(
+    maps: Maps, points: wp.array2d(dtype=wp.vec2), reach: wp.array2d(dtype=float), heights: wp.array2d(dtype=float)
+):
+    robot, k = wp.tid()
+    heights[robot, k] = highest(maps, robot, points[robot, k], reach[robot, k])
+
+
+class Heights:
+    """Walking surfaces under ``n`` robots.
+
+    Attributes:
+        maps: for kernels.
+    """
+
+    def __init__(self) -> None:
+        self.maps = Maps()
+
+    def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
+        """Height (n, ...), m, of the highest surface not above `reach` under points (n, ..., 2), or 0."""
+        shape = points.shape[:-1]
+        heights = torch.empty(len(points), shape[1:].numel())
+        at = points.reshape(*heights.shape, 2).contiguous()
+        limits = reach.expand(shape).reshape(heights.shape).contiguous()
+        inputs = [
+            self.maps,
+            wp.from_torch(at, dtype=wp.vec2, return_ctype=True),
+            wp.from_torch(limits, return_ctype=True),
+        ]
+        wp.launch(_look_up, heights.shape, inputs, [wp.from_torch(heights, return_ctype=True)], device="cpu")
+        return heights.reshape(shape)
+
+
+class HeightMap(Heights):
+    """One walking surface over a regular grid, however far up, under all robots."""
+
+    def __init__(self, origin: tuple[float, float], cell: float, heights: Tensor) -> None:
+        """
+        Args:
+            origin: of cell (0, 0), m.
+            cell: side of a cell, m.
+            heights: (X, Y), float32, m.
+        """
+        super().__init__()
+        self.maps.blocks = wp.from_torch(heights[None].contiguous())
+        self.maps.table = wp.zeros((1, 1, 1, 1), dtype=wp.int32, device="cpu")
+        self.maps.origin, self.maps.cell, self.maps.cells = wp.vec2(origin), cell, wp.vec2i(heights.shape)
+        self.maps.bits = max(heights.shape).bit_length()
+        self.maps.headroom = float("inf")
+
+
+class TileHeights(Heights):
+    """Walking surfaces under robots that are each on a tile of their own.
 
     A map is made of blocks, and those of a tile that are alike are kept once, since most of a floor is flat.
 
@@ -84,9 +153,11 @@ class TileHeights:
     """
 
     def __init__(self, tiles: tuple[Tile, ...]) -> None:
+        super().__init__()
         self._tiles = tiles
-        self._cells = round(tiles[0].side / CELL)
-        side, layers = -(-self._cells // BLOCK), max(len(tile.layers) for tile in tiles)
+        cells = round(tiles[0].side / CELL)
+        self.maps.cell, self.maps.cells, self.maps.bits = CELL, wp.vec2i(cells, cells), BITS
+        side, layers = -(-cells // BLOCK), max(len(tile.layers) for tile in tiles)
         self._made = np.zeros(len(tiles), bool)
         # block of each tile, layer and place, -1 where there is no surface
         self._table = torch.full((len(tiles), layers, side, side), -1, dtype=torch.int32)
@@ -107,22 +178,8 @@ class TileHeights:
                 self._made[t] = True
         if len(made) > 1:
             self._blocks = torch.cat(made)
-        self._maps = [wp.from_torch(part, return_ctype=True) for part in (self._blocks, self._table, self.tile)]
-
-    def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
-        """Height (n, ...) of the highest surface not above `reach` under points (n, ..., 2); 0 where there is none."""
-        shape = points.shape[:-1]
-        heights = torch.empty(len(points), shape[1:].numel())
-        at = points.reshape(*heights.shape, 2).contiguous()
-        limits = reach.expand(shape).reshape(heights.shape).contiguous()
-        inputs = [
-            *self._maps,
-            self._cells,
-            wp.from_torch(at, dtype=wp.vec2, return_ctype=True),
-            wp.from_torch(limits, return_ctype=True),
-        ]
-        wp.launch(_highest, heights.shape, inputs, [wp.from_torch(heights, return_ctype=True)], device="cpu")
-        return heights.reshape(shape)
+        self.maps.blocks, self.maps.table = wp.from_torch(self._blocks), wp.from_torch(self._table)
+        self.maps.which = wp.from_torch(self.tile)
 
 
 def _cut(layers: NDArray[np.int16]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

@@ -17,7 +17,8 @@ from romnav.robot.dynamics import Head
 from romnav.robot.g1 import HEAD, Humanoids, build_spec
 from romnav.robot.gaits import Gait, GaitLibrary
 from romnav.robot.heights import TileHeights
-from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
+from romnav.robot.locomotion.control import Controller, has_fallen
+from romnav.robot.locomotion.planar import heading_of
 from romnav.robot.locomotion.train import load_policy
 from romnav.robot.spec import RobotSpec
 from romnav.robot.statics import NOTHING

@@ -9,20 +9,16 @@ import torch
 from torch import Tensor
 
 from romnav.robot.g1 import JOINTS, Robots
+from romnav.robot.heights import Heights
 from romnav.robot.locomotion.legs import Legs
-from romnav.robot.locomotion.lip import Reference, Walker, turn_xy, wrap
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, reflect
-from romnav.robot.locomotion.terrain import Heights
+from romnav.robot.locomotion.planar import heading_of, turn_xy, wrap
+from romnav.robot.locomotion.walker import Reference, Walker
 from romnav.robot.spec import LocomotionSpec
 
 SCAN = tuple((x, y) for y in (-0.15, 0.15) for x in np.linspace(-0.4, 1.0, 15))
 """Height scan ahead of and beside the pelvis in the heading frame, m."""
 TARGETS = len(JOINTS)
-
-
-def heading_of(orientation: Tensor) -> Tensor:
-    """Yaw (n,) of rotations (n, 3, 3)."""
-    return torch.atan2(orientation[:, 1, 0], orientation[:, 0, 0])
 
 
 def has_fallen(robots: Robots) -> Tensor:
@@ -47,6 +43,11 @@ class Controller:
         self._scan = torch.tensor(SCAN, dtype=torch.float32)
         self._rest = torch.cat([self.walker.stance().reshape(12), torch.zeros(3)])
 
+    @property
+    def reference(self) -> Reference:
+        """That of this control step."""
+        return self.walker.reference
+
     def stand(self, ids: Tensor, position: Tensor, heading: Tensor, clock: Tensor, command: Tensor) -> None:
         """Put robots `ids` on their feet at `position` (k, 3) (the ground's height), beginning a step.
 
@@ -57,8 +58,8 @@ class Controller:
         lift = position + torch.tensor([0.0, 0.0, gait.pelvis + 0.003])
         qpos = torch.cat([lift, half, self._rest.expand(k, -1)], dim=1)
         side = torch.where(clock < gait.step_ticks, 1.0, -1.0)
-        w = self.walker.w
-        sway = side * gait.width / 2 * w * np.tanh(w * self.walker.duration / 2)
+        w, duration = self.walker.gait.w, self.walker.gait.duration
+        sway = side * gait.width / 2 * w * np.tanh(w * duration / 2)
         start = 0.5 * command[:, :2].clamp(-0.5, 0.5)
         velocity = start + torch.stack([torch.zeros(k), sway], dim=1)
         qvel = torch.zeros(k, 6 + TARGETS)
@@ -69,8 +70,7 @@ class Controller:
 
     def refer(self, command: Tensor, ground: Heights, first: Tensor) -> Reference:
         """Reference of this control step, (n,) `first` for robots just placed."""
-        self.reference = self.walker.update(self.robots, command, ground, first=first)
-        return self.reference
+        return self.walker.update(self.robots, command, ground, first)
 
     def act(self, action: Tensor, ids: Tensor | None = None) -> None:
         """Step robots with residual actions (n, 15) as seen in the mirror of `observe`; all, or only `ids`."""
@@ -139,18 +139,21 @@ class Controller:
         """That of robots `ids` (k,) alone, which are `robots` now."""
         part = Controller(self.spec, robots)
         for name in Walker.STATE:
-            setattr(part.walker, name, getattr(self.walker, name)[ids])
+            getattr(part.walker, name).copy_(getattr(self.walker, name)[ids])
         part.action = self.action[ids]
         return part
 
     def state_dict(self) -> dict[str, Any]:
         """State besides the robots'."""
         return {name: getattr(self.walker, name).clone() for name in Walker.STATE} | {
-            "action": self.action.clone(), "reference": dict(vars(self.reference)),
+            "action": self.action.clone(),
+            "reference": {name: value.clone() for name, value in vars(self.reference).items()},
         }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name in Walker.STATE:
-            setattr(self.walker, name, state[name].clone())
-        self.action, self.reference = state["action"].clone(), Reference(**state["reference"])
+            getattr(self.walker, name).copy_(state[name])
+        for name, value in state["reference"].items():
+            getattr(self.reference, name).copy_(value)
+        self.action = state["action"].clone()

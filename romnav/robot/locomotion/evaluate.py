@@ -12,8 +12,8 @@ from torch import Tensor
 
 from romnav.progress import Progress
 from romnav.robot.g1 import Humanoids
-from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
-from romnav.robot.locomotion.lip import turn_xy, wrap
+from romnav.robot.locomotion.control import Controller, has_fallen
+from romnav.robot.locomotion.planar import heading_of, turn_xy, wrap
 from romnav.robot.locomotion.terrain import Ground, Lane, flat, ramp, stairs, steer, uturn
 from romnav.robot.locomotion.train import load_policy
 from romnav.robot.spec import LocomotionSpec

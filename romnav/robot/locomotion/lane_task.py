@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from romnav.robot.g1 import Humanoids
-from romnav.robot.locomotion.control import heading_of
+from romnav.robot.locomotion.planar import heading_of
 from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.locomotion.terrain import Ground, Lane, steer
 from romnav.robot.spec import LocomotionSpec

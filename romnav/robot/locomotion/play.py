@@ -12,8 +12,9 @@ import torch
 
 from romnav.errors import RomnavError
 from romnav.robot.g1 import Humanoids
-from romnav.robot.locomotion.control import Controller, has_fallen, heading_of
+from romnav.robot.locomotion.control import Controller, has_fallen
 from romnav.robot.locomotion.evaluate import Row, rows
+from romnav.robot.locomotion.planar import heading_of
 from romnav.robot.locomotion.terrain import Ground, steer
 from romnav.robot.locomotion.train import load_policy
 

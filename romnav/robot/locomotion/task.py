@@ -10,11 +10,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from romnav.robot.g1 import Humanoids, Robots
+from romnav.robot.heights import Heights
 from romnav.robot.locomotion.clf import Clf
-from romnav.robot.locomotion.control import TARGETS, Controller, has_fallen, heading_of
-from romnav.robot.locomotion.lip import Reference, turn_xy, wrap
+from romnav.robot.locomotion.control import TARGETS, Controller, has_fallen
 from romnav.robot.locomotion.mirror import PRIVILEGED_MIRROR, reflect
-from romnav.robot.locomotion.terrain import Heights
+from romnav.robot.locomotion.planar import heading_of, turn_xy, wrap
+from romnav.robot.locomotion.walker import Reference
 from romnav.robot.spec import LocomotionSpec
 
 
@@ -163,7 +164,7 @@ class WalkingEnv(VecEnv):
         value = self.clf(error, rates, self._tolerance)
         self._slope = torch.where(begin, -self.clf.decay * value, (value - self.value) / self.dt)
         self.value = value
-        self._last.update(sole=sole, swing=ref.swing, height=ref.height)
+        self._last.update(sole=sole, swing=ref.swing.clone(), height=ref.height.clone())
         self.first = torch.zeros_like(self.first)
 
     def get_observations(self) -> TensorDict:

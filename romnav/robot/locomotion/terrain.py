@@ -3,47 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from romnav.robot.heights import HeightMap
 from romnav.robot.statics import Geoms
-
-
-class Heights(Protocol):
-    """Walking surfaces under ``n`` robots."""
-
-    def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
-        """Height (n, ...) of the highest surface not above `reach` (n, ...) under points (n, ..., 2), m."""
-        ...
-
-
-class HeightMap(NamedTuple):
-    """Walking surfaces over a regular grid, a layer for each storey.
-
-    Attributes:
-        origin: (2,) position of cell (0, 0), m.
-        cell: side of a cell, m.
-        heights: (layers, nx, ny), m; -inf where a layer has no surface.
-    """
-
-    origin: Tensor
-    cell: float
-    heights: Tensor
-
-    def __call__(self, points: Tensor, reach: Tensor) -> Tensor:
-        """Height of the highest surface not above `reach` under points (..., 2); 0 where there is none."""
-        index = ((points - self.origin) / self.cell).floor().long()
-        ix = index[..., 0].clamp(0, self.heights.shape[1] - 1)
-        iy = index[..., 1].clamp(0, self.heights.shape[2] - 1)
-        if self.heights.shape[0] == 1:
-            return self.heights[0, ix, iy]
-        at = self.heights[:, ix, iy]
-        below = torch.where(at <= reach, at, -torch.inf).amax(0)
-        return torch.where(below.isfinite(), below, 0.0)
 
 
 @dataclass
@@ -214,9 +182,7 @@ class Ground:
         self.geoms = Geoms.boxes(
             np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3), np.array(quat).reshape(-1, 4)
         )
-        self.map = HeightMap(
-            torch.tensor(origin, dtype=torch.float32), cell, torch.tensor(heights, dtype=torch.float32)[None]
-        )
+        self.map = HeightMap((origin[0], origin[1]), cell, torch.tensor(heights, dtype=torch.float32))
         points = max(len(lane.path) for lane in lanes)
         path = np.stack(
             [

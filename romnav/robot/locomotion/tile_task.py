@@ -9,7 +9,7 @@ from torch import Tensor
 
 from romnav.robot.g1 import Humanoids
 from romnav.robot.heights import TileHeights
-from romnav.robot.locomotion.control import heading_of
+from romnav.robot.locomotion.planar import heading_of
 from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.spec import DRIVERS, LocomotionSpec, TileMixSpec
 from romnav.robot.tiles import change_layer, geoms

@@ -11,11 +11,12 @@ import torch
 
 from romnav.errors import RomnavError
 from romnav.robot.g1 import Humanoids
+from romnav.robot.heights import HeightMap
 from romnav.robot.locomotion.control import Controller, has_fallen
 from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
 from romnav.robot.locomotion.lane_task import LocomotionEnv
-from romnav.robot.locomotion.lip import turn_xy
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR
+from romnav.robot.locomotion.planar import turn_xy
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
@@ -311,9 +312,7 @@ def test_the_gait_does_not_wind_up_against_a_wall(wall: bool) -> None:
     command = torch.tensor([[0.8, 0.0, 0.0]])
     control.stand(torch.arange(1), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, dtype=torch.long), command)
 
-    def ground(points: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(points.shape[:-1])
-
+    ground = HeightMap((0.0, 0.0), 1.0, torch.zeros(1, 1))
     asked = []
     for tick in range(150):
         control.refer(command, ground, torch.tensor([tick == 0]))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from romnav.robot.g1 import build_spec
-from romnav.robot.locomotion.terrain import Ground, HeightMap, Slab, curriculum, flat, ramp, rough, stairs, steer, uturn
+from romnav.robot.locomotion.terrain import Ground, Slab, curriculum, flat, ramp, rough, stairs, steer, uturn
 from romnav.robot.spec import RobotSpec
 
 
@@ -45,13 +45,6 @@ def test_stairs_rise_by_their_riser_on_every_tread() -> None:
     tops = [s.z0 for s in lane.slabs]
     assert max(tops) == pytest.approx(20 * 0.17)
     assert np.abs(np.diff([0.0, *tops, 0.0])) == pytest.approx(0.17)
-
-
-def test_layered_map_gives_the_surface_within_reach() -> None:
-    heights = torch.tensor([[[0.0]], [[3.0]]])
-    surface = HeightMap(torch.zeros(2), 1.0, heights)
-    point = torch.tensor([[0.5, 0.5], [0.5, 0.5]])
-    assert surface(point, torch.tensor([0.5, 3.4])).tolist() == [0.0, 3.0]
 
 
 def test_arc_length_and_projection(ground: Ground) -> None:
