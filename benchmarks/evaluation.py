@@ -1,46 +1,32 @@
-"""Evaluation of one arm: 1,024 paired episodes of up to 120 s at the "cpu" scale.
+"""Evaluation of a committed arm: the paired episodes of up to 120 s, once under each backend of the LiDAR.
 
-By default the policy has random weights. It reaches next to no goal, so that almost every episode runs to its end:
-no arm takes longer. With ``--policy`` and ``--encoder``, files of a trained arm, that policy
-drives, once under each backend of the LiDAR, and the paired difference of their success is reported beside the times.
+The policy is `ARM` of the "cpu" scale, as ``romnav eval`` drives it. The mesh backend casts rays at the triangles of
+the same solids, so the paired difference of success tells whether the columns change what a policy reaches.
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 import time
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
-import torch
-from _common import CORES, ROOT, report
-from _learner import CACHE, ours, scale, sensors
+from _common import ROOT, arguments, report
 from numpy.typing import NDArray
 
 from romnav.evaluation import episodes
 from romnav.evaluation.paired.run import run
 from romnav.evaluation.rollout import Policy
-from romnav.evaluation.spec import EpisodeSetSpec
-from romnav.experiment.scales import Scale
-from romnav.navigation import checkpoint
-from romnav.sensing import encoder as encoders
+from romnav.experiment.kinds._driven import Driven
+from romnav.experiment.kinds.episodes import paired_set
+from romnav.experiment.project import Project
+from romnav.experiment.workspace import Workspace
 from romnav.sensing.lidar import Lidar
-from romnav.world.build import build
-from romnav.world.world import World
 
+ARM = "rom"
+LIMIT = 120.0
+"""Longest time that all episodes may take, s."""
 RESAMPLES = 10_000
-
-
-def driver(s: Scale, world: World, backend: str, options: argparse.Namespace) -> Policy:
-    """The policy to evaluate, seeing through ``backend``."""
-    perception = sensors(s, world)
-    if options.encoder:
-        perception.lidar.encoder = encoders.load(options.encoder)
-    spec = s.lidar.model_copy(update={"backend": backend})
-    perception.lidar.sensor = Lidar([tile.solids for tile in world.tiles], spec)
-    if not options.policy:
-        return Policy(ours(s, world).algorithm.actor, perception)
-    return Policy(checkpoint.load_actor(options.policy, perception.encoder), perception)
 
 
 def paired(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> tuple[float, float]:
@@ -54,37 +40,40 @@ def paired(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> tuple[float, float]:
 
 def main() -> None:
     """Measure, print and write ``results/bench/evaluation.json``."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=EpisodeSetSpec().episodes)
-    parser.add_argument("--policy", type=Path, help="policy.pt of a trained arm")
-    parser.add_argument("--encoder", type=Path, help="encoder.pt it was trained with")
-    parser.add_argument("--out", type=Path, default=ROOT / "results/bench")
-    options = parser.parse_args()
-    torch.set_num_threads(CORES)
-    s = scale()
-    spec = EpisodeSetSpec(episodes=options.episodes)
-    world = build(spec.world, CACHE)
-    drawn = episodes.draw("bench", spec, world)
+    options = arguments(__doc__, episodes=1024)
+    work = Workspace(Project(ROOT, ROOT / "results"), "cpu")
+    driven, path = Driven.by(work, ARM, 0), paired_set(work)
+    whole = episodes.load(path)
+    walked = replace(whole, columns={name: column[: options.episodes] for name, column in whole.columns.items()})
+    world = episodes.terrain(whole, path, work.project.worlds)
     times, success = {}, {}
-    for backend in ("columns", "mesh") if options.policy else ("columns",):
-        policy = driver(s, world, backend, options)
+    for backend in ("columns", "mesh"):
+        policy = driven.driver(world, "cpu")
+        assert isinstance(policy, Policy)
+        spec = driven.settings.lidar.model_copy(update={"backend": backend})
+        policy.perception.lidar.sensor = Lidar([tile.solids for tile in world.tiles], spec)
         start = time.perf_counter()
-        measured = run(policy, world, drawn, s.navigation.env, s.evaluation)
-        times[backend] = [time.perf_counter() - start]
+        measured = run(policy, world, walked, driven.settings.navigation.env, work.settings.evaluation)
+        times[backend] = time.perf_counter() - start
         success[backend] = measured["outcome"] == "success"
-    own = times.pop("columns")
-    more = {"limit": 120.0, "success": {k: float(v.mean()) for k, v in success.items()}}
-    agree = True
-    if options.policy:
-        low, high = more["success_difference_percent"] = paired(success["columns"], success["mesh"])
-        agree = low <= 0.0 <= high
-        print(f"success, columns minus mesh: 95 % interval [{low:+.2f}, {high:+.2f}] %")
-    kind = "a trained" if options.policy else "an untrained"
-    work = f"{options.episodes} episodes of up to {s.evaluation.duration:.0f} s, {kind} policy"
-    peers = {f"romnav with the {k} LiDAR": v for k, v in times.items()}
-    report("evaluation", work, "s", own, peers, options.out, agree=agree, **more)
-    if not agree or own[0] > more["limit"]:
-        raise SystemExit("slower than two minutes, or the LiDAR's backends give different success")
+        print(f"{backend}: {times[backend]:.0f} s, success {success[backend].mean():.1%}", flush=True)
+    low, high = paired(success["columns"], success["mesh"])
+    agree = low <= 0.0 <= high
+    print(f"success, columns minus mesh: 95 % interval [{low:+.2f}, {high:+.2f}] %")
+    report(
+        "evaluation",
+        f"{len(walked)} episodes of up to {work.settings.evaluation.duration:.0f} s, {ARM} of the cpu scale",
+        "s",
+        [times["columns"]],
+        {"romnav with the mesh LiDAR": [times["mesh"]]},
+        options.out,
+        agree=agree,
+        limit=LIMIT,
+        success={backend: float(reached.mean()) for backend, reached in success.items()},
+        success_difference_percent=(low, high),
+    )
+    if not agree or times["columns"] > LIMIT:
+        sys.exit("slower than two minutes, or the LiDAR's backends give different success")
 
 
 if __name__ == "__main__":

@@ -13,10 +13,16 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from romnav.sensing.lidar import Lidar
+from romnav.sensing.spec import LidarSpec
+from romnav.world.solids import SolidsBuilder
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -122,6 +128,40 @@ def test_damaged_files_are_told_apart_by_what_readers_make_of_them(
     found = {damage._try(kind, n, tmp_path) for n in range(8)}
     assert "refused" in found
     assert found <= {"refused", "unharmed", "another"}
+
+
+@pytest.mark.parametrize("overlap", [-5e-6, 0.05], ids=["ray along an edge", "ray at a face"])
+def test_a_lost_solid_is_one_that_no_rounding_explains(common: ModuleType, overlap: float) -> None:
+    """A wall, and behind it a pole that one column sees past the wall's edge or does not see."""
+    lidar = importlib.import_module("lidar")
+    spec = LidarSpec(rows=15, columns=55, field=(-90.0, 90.0))
+    slope = math.tan(math.radians(20.0))  # of a column's rays
+    boxes = [((2.0, 2.1), (-3.0, 2.0 * slope + overlap)), ((4.0, 4.1), (4.0 * slope - 0.02, 4.0 * slope + 0.02))]
+
+    def cast(bundle: NDArray) -> tuple[NDArray, NDArray]:
+        """By slabs, in float64."""
+        origin, direction = bundle[..., :3].astype(float), bundle[..., 3:].astype(float)
+        hits = []
+        for x, y in boxes:
+            with np.errstate(divide="ignore"):
+                t = (np.array([x, y, (0.0, 3.0)]).T[:, None, None, None] - origin) / direction
+            near, far = t.min(0).max(-1), t.max(0).min(-1)
+            hits.append(np.where((near <= far) & (far > 0), near, np.inf))
+        return np.min(hits, axis=0), np.argmin(hits, axis=0)
+
+    def images(shown: list[Any]) -> tuple[Lidar, NDArray]:
+        b = SolidsBuilder()
+        for x, y in shown:
+            b.box((sum(x) / 2, sum(y) / 2), (x[1] - x[0], y[1] - y[0]), (0.0, 3.0))
+        sensor = Lidar([b.build()], spec)
+        return sensor, sensor.scan(*poses).numpy()
+
+    poses = lidar.Poses(torch.zeros(1, dtype=torch.int32), torch.tensor([[0.0, 0.0, 1.265]]), torch.zeros(1))
+    sensor, ranges = images(boxes)
+    assert lidar.lost([cast], poses, sensor.directions, ranges) == (1, 0)
+    boxes[0] = boxes[0][0], (-3.0, 2.0 * slope - 0.05)
+    assert lidar.lost([cast], poses, sensor.directions, images(boxes)[1]) == (2, 0)
+    assert lidar.lost([cast], poses, sensor.directions, images(boxes[:1])[1]) == (2, 1)
 
 
 def test_the_guarantee_counts_collisions(common: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,6 +75,8 @@ class Image:
     heading_x: wp.array(dtype=Lanes)
     heading_y: wp.array(dtype=Lanes)
     left: float
+    left_cos: float
+    left_sin: float
     top: float
     columns_per_radian: float
     rows_per_radian: float
@@ -166,8 +168,13 @@ def _draw(
     far = distance + solid.radius
     upper = image.slope[0]
     lower = image.slope[image.rows - 1]
+    # how far the centre lies beyond the nearer of the image's left and right edge
+    ahead = -cos * px - sin * py
+    aside = wp.abs(cos * py - sin * px)
+    beyond = image.left_cos * aside - image.left_sin * ahead
     if (
         near > image.max_range
+        or beyond > solid.radius
         or solid.lowest - origin[2] > wp.max(upper * near, upper * far)
         or solid.highest - origin[2] < wp.min(lower * near, lower * far)
     ):

@@ -61,6 +61,7 @@ class Lidar(Sensor):
         image.sin = wp.array(np.sin(elevation), dtype=float, device=device)
         image.heading_x, image.heading_y = columns.lanes(self._heading[0]), columns.lanes(self._heading[1])
         image.left, image.columns_per_radian = width / 2, spec.columns / width
+        image.left_cos, image.left_sin = math.cos(width / 2), math.sin(width / 2)
         image.top, image.rows_per_radian = high, spec.rows / (high - low)
         image.min_range, image.max_range = spec.min_range, spec.max_range
         image.min_field, image.max_field = (math.sin(math.radians(e)) for e in spec.field)

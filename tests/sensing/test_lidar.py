@@ -208,7 +208,7 @@ def test_inside_a_solid_nothing_is_seen(backend: Literal["columns", "mesh"]) -> 
     assert (scan_one(Lidar([b.build()], spec), (10.0, 10.0, 1.265)) == 0).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     shape=st.sampled_from(["box", "cylinder"]),
     centre=st.tuples(st.floats(-6, 6), st.floats(-6, 6)),
@@ -218,6 +218,7 @@ def test_inside_a_solid_nothing_is_seen(backend: Literal["columns", "mesh"]) -> 
     angle=st.floats(-4, 4),
     slope=st.floats(-1, 1),
     slope_bottom=st.floats(-1, 1),
+    azimuth=st.sampled_from([90.0, 180.0, 220.0, 360.0]),
 )
 def test_any_single_solid(
     shape: str,
@@ -228,6 +229,7 @@ def test_any_single_solid(
     angle: float,
     slope: float,
     slope_bottom: float,
+    azimuth: float,
 ) -> None:
     assume(thickness > abs(slope - slope_bottom) * size[0] / 2)  # lids that do not cross
     b = SolidsBuilder()
@@ -237,7 +239,7 @@ def test_any_single_solid(
     else:
         b.cylinder(centre, size[0] / 2, (base, base + thickness))
     solids = b.build()
-    lidar = Lidar([solids], COARSE)
+    lidar = Lidar([solids], COARSE.model_copy(update={"azimuth": azimuth}))
     truth, _ = expected(solids, np.zeros(3), 0.0, lidar)
     # rays along an edge may fall on either side of it
     assert (np.abs(scan_one(lidar, (0.0, 0.0, 0.0)) - truth) > 1e-3).sum() <= 2

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from romnav.kernels import wp
@@ -57,6 +59,48 @@ def test_images_equal_those_of_all_solids(tiles: list[tuple[Solids, Grids]], mon
     culled = Lidar(solids, SPEC).scan(*at).clone()
     monkeypatch.setattr(visibility, "find", everything)
     assert torch.equal(culled, Lidar(solids, SPEC).scan(*at))
+
+
+Wall = tuple[bool, float, float, float, float]
+METRES = st.floats(0.0, 24.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    walls=st.lists(st.tuples(st.booleans(), METRES, METRES, st.floats(0.0, 2.0), st.floats(0.5, 4.0)), max_size=6),
+    hole=st.floats(0.0, 6.0),
+    yaw=st.sampled_from([0.0, 0.5, np.pi / 2]),
+    azimuth=st.sampled_from([90.0, 180.0, 220.0, 360.0]),
+    seed=st.integers(0, 1000),
+)
+def test_no_walls_holes_and_doors_hide_what_is_seen(
+    walls: list[Wall], hole: float, yaw: float, azimuth: float, seed: int
+) -> None:
+    """Walls with doors on two storeys between which a slab has a hole; poles and turned boxes all over."""
+    rng = np.random.default_rng(seed)
+    b = SolidsBuilder()
+    b.box((12.0, 12.0), (24.0, 24.0), (-0.2, 0.0), label=Label.GROUND, layers=(0, 0))
+    b.box((9.0 - hole / 2, 12.0), (18.0 - hole, 24.0), (3.8, 4.0), label=Label.GROUND, layers=(1, 1))
+    b.box((21.0, 12.0), (6.0, 24.0), (3.8, 4.0), label=Label.GROUND, layers=(1, 1))
+    for along_x, at, door, width, height in walls:
+        for low, high in ((0.0, door - width / 2), (door + width / 2, 24.0)):
+            if high > low + 1e-3:
+                centre, size = ((low + high) / 2, at), (high - low, 0.15)
+                floor = 4.0 * int(rng.integers(2))
+                b.box(*((centre, size) if along_x else (centre[::-1], size[::-1])), (floor, floor + height))
+    for x, y, floor in zip(*rng.uniform(0.0, 24.0, (2, 24)), 4.0 * rng.integers(0, 2, 24), strict=True):
+        b.cylinder((x, y), 0.1, (floor, floor + 1.5))
+        b.box((y, x), (0.8, 0.4), (floor, floor + 1.0), yaw=yaw)
+    solids = b.build()
+    origin = torch.from_numpy(rng.uniform((-1.0, -1.0, 0.5), (25.0, 25.0, 6.0), (64, 3))).float()
+    at = torch.zeros(64, dtype=torch.int32), origin, torch.from_numpy(rng.uniform(-4.0, 4.0, 64)).float()
+    spec = LidarSpec(rows=15, columns=55, azimuth=azimuth)
+    culled = Lidar([solids], spec).scan(*at, labels=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(visibility, "find", everything)
+        whole = Lidar([solids], spec).scan(*at, labels=True)
+    assert torch.equal(culled[0], whole[0])
+    assert torch.equal(culled[1], whole[1])
 
 
 def test_places_list_few_solids(tiles: list[tuple[Solids, Grids]]) -> None:
