@@ -15,7 +15,7 @@ from romnav.sensing.sensor import Sensor
 from romnav.sensing.spec import DepthSpec
 from romnav.world.solids import Solids
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "optimization_level": 3})
 
 _MARGIN = wp.constant(1.0e-4)
 """Slack of the tests that leave a solid out, m: rounding may not cut what the exact tests would see."""
@@ -61,14 +61,68 @@ def _furthest(solid: columns.Solid, ou: float, ov: float, height: float, d: wp.v
     return nearest + solid.half_u * wp.abs(du) + solid.half_v * wp.abs(dv) + half * wp.abs(d[2])
 
 
+@wp.func
+def _inward(a: wp.vec3, b: wp.vec3, inside: wp.vec3):  # type: ignore[no-untyped-def]
+    """Normal of the plane of two rays, to the side of a third."""
+    normal = wp.cross(a, b)
+    return wp.where(wp.dot(normal, inside) < 0.0, -normal, normal)
+
+
 @wp.kernel
-def _cast(
+def _list(
     solids: wp.array(dtype=columns.Solid),
     first: wp.array(dtype=wp.int32),
     rays: wp.array2d(dtype=wp.vec3),
-    limits: wp.vec2,
     reach: float,
     tile: wp.array(dtype=wp.int32),
+    origin: wp.array(dtype=wp.vec3),
+    torso: wp.array(dtype=wp.mat33),
+    near: wp.array2d(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+):
+    """Solids that may reach into an image: within reach, and between the planes of its edges."""
+    env = wp.tid()
+    o = origin[env]
+    rows = rays.shape[0]
+    last = rays.shape[1] - 1
+    middle = torso[env] * rays[rows // 2, last // 2]
+    a = torso[env] * rays[0, 0]
+    b = torso[env] * rays[0, last]
+    c = torso[env] * rays[rows - 1, last]
+    d = torso[env] * rays[rows - 1, 0]
+    above = _inward(a, b, middle)
+    right = _inward(b, c, middle)
+    below = _inward(c, d, middle)
+    left = _inward(d, a, middle)
+    found = int(0)  # noqa: RUF046, UP018 - in Warp, int() declares a variable that changes
+    for i in range(first[tile[env]], first[tile[env] + 1]):
+        solid = solids[i]
+        px = o[0] - solid.x
+        py = o[1] - solid.y
+        distance = solid.radius + reach
+        if px * px + py * py > distance * distance or solid.lowest > o[2] + reach or solid.highest < o[2] - reach:
+            continue
+        ou = solid.cos * px + solid.sin * py
+        ov = solid.cos * py - solid.sin * px
+        if (
+            _furthest(solid, ou, ov, o[2], above) < -_MARGIN
+            or _furthest(solid, ou, ov, o[2], right) < -_MARGIN
+            or _furthest(solid, ou, ov, o[2], below) < -_MARGIN
+            or _furthest(solid, ou, ov, o[2], left) < -_MARGIN
+        ):
+            continue
+        near[env, found] = i
+        found += 1
+    count[env] = found
+
+
+@wp.kernel
+def _cast(
+    solids: wp.array(dtype=columns.Solid),
+    near: wp.array2d(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+    rays: wp.array2d(dtype=wp.vec3),
+    limits: wp.vec2,
     origin: wp.array(dtype=wp.vec3),
     torso: wp.array(dtype=wp.mat33),
     depth: wp.array3d(dtype=float),
@@ -82,13 +136,10 @@ def _cast(
     plane = wp.cross(left, right)
     for column in range(rays.shape[1]):
         depth[env, row, column] = limits[1]
-    for i in range(first[tile[env]], first[tile[env] + 1]):
-        solid = solids[i]
+    for i in range(count[env]):
+        solid = solids[near[env, i]]
         px = o[0] - solid.x
         py = o[1] - solid.y
-        distance = solid.radius + reach
-        if px * px + py * py > distance * distance or solid.lowest > o[2] + reach or solid.highest < o[2] - reach:
-            continue
         ou = solid.cos * px + solid.sin * py
         ov = solid.cos * py - solid.sin * px
         if (
@@ -152,16 +203,23 @@ class DepthCamera(Sensor):
         self._reach = spec.max_range * float(np.linalg.norm(rays, axis=-1).max())
         packed = np.concatenate([columns.pack(s) for s in solids])
         self._solids = wp.array(packed, dtype=columns.Solid, device=device)
+        self._most = max(map(len, solids))
         self._first = wp.array(np.cumsum([0, *map(len, solids)]), dtype=wp.int32, device=device)
         wp.load_module(device=device)
 
     def _launch(self, pose: list[Tensor], ranges: Tensor, labels: Tensor | None) -> None:
         limits = wp.vec2(self.spec.min_range, self.spec.max_range)
-        inputs = [self._solids, self._first, self._rays, limits, self._reach]
-        inputs += [wp.from_torch(x, dtype=t) for x, t in zip(pose, (wp.int32, wp.vec3, wp.mat33), strict=True)]
-        inputs += [wp.from_torch(ranges), None if labels is None else wp.from_torch(labels)]
+        tile, origin, torso = (
+            wp.from_torch(x, dtype=t) for x, t in zip(pose, (wp.int32, wp.vec3, wp.mat33), strict=True)
+        )
+        near = wp.empty((len(ranges), self._most), dtype=wp.int32, device=self.device)
+        count = wp.empty(len(ranges), dtype=wp.int32, device=self.device)
         stream = None if self.device == "cpu" else wp.stream_from_torch(torch.device(self.device))
-        wp.launch(_cast, ranges.shape[:2], inputs, device=self.device, stream=stream)
+        inputs = [self._solids, self._first, self._rays, self._reach, tile, origin, torso]
+        wp.launch(_list, len(ranges), inputs, [near, count], device=self.device, stream=stream)
+        inputs = [self._solids, near, count, self._rays, limits, origin, torso]
+        outputs = [wp.from_torch(ranges), None if labels is None else wp.from_torch(labels)]
+        wp.launch(_cast, ranges.shape[:2], inputs, outputs, device=self.device, stream=stream)
 
     def _orientation(self, yaw: Tensor, tilt: Tensor) -> tuple[Tensor, ...]:
         """Rotation (E, 3, 3) from the torso to the tile frame, by yaw, then pitch, then roll."""
