@@ -8,12 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from romnav.kernels import wp
 from romnav.robot.g1 import JOINTS, Robots
 from romnav.robot.heights import Heights
 from romnav.robot.locomotion.legs import Legs
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, reflect
-from romnav.robot.locomotion.planar import heading_of, turn_xy, wrap
-from romnav.robot.locomotion.walker import Reference, Walker
+from romnav.robot.locomotion.observation import observe
+from romnav.robot.locomotion.planar import turn_xy
+from romnav.robot.locomotion.walker import Reference, Walker, mat33, plain, vec3
 from romnav.robot.spec import LocomotionSpec
 
 SCAN = tuple((x, y) for y in (-0.15, 0.15) for x in np.linspace(-0.4, 1.0, 15))
@@ -40,8 +42,9 @@ class Controller:
         self.legs = Legs(robots.model)
         self.walker = Walker(spec.gait, self.legs, self.dt, robots.count)
         self.action = torch.zeros(robots.count, TARGETS)
-        self._scan = torch.tensor(SCAN, dtype=torch.float32)
         self._rest = torch.cat([self.walker.stance().reshape(12), torch.zeros(3)])
+        scan = wp.array(SCAN, dtype=wp.vec2, device="cpu")
+        self._constants = [wp.from_torch(self._rest), scan, *map(wp.from_torch, MIRROR)]
 
     @property
     def reference(self) -> Reference:
@@ -85,39 +88,15 @@ class Controller:
         The policy always sees itself standing on the left foot, so it is left-right symmetric by construction
         and learns one step instead of two.
         """
-        r, ref = self.robots, self.reference
-        yaw = heading_of(r.orientation)
-        angle = 2 * torch.pi * (ref.phase + (ref.side < 0)) / 2
-        local = turn_xy(r.com_velocity[:, :2], -yaw)
-        feet = torch.cat([turn_xy((ref.sole - r.pelvis[:, None])[..., :2], -yaw[:, None]),
-                          (ref.sole - r.pelvis[:, None])[..., 2:]], dim=-1)  # fmt: skip
-        goal = ref.sole.clone()
-        goal[torch.arange(len(yaw)), (ref.side > 0).long()] = ref.foothold
-        goal = goal - ref.sole
-        goal = torch.cat([turn_xy(goal[..., :2], -yaw[:, None]), goal[..., 2:]], dim=-1)
-        points = r.pelvis[:, None, :2] + turn_xy(self._scan.expand(len(yaw), -1, -1), yaw[:, None])
-        level = ref.sole[..., 2].amin(1)
-        scan = ground(points, (level + 0.8)[:, None]) - level[:, None]
-        seen = torch.cat(
-            [
-                command,
-                torch.stack([torch.sin(angle), torch.cos(angle)], dim=1),
-                r.orientation[:, 2],
-                0.25 * r.spin,
-                local,
-                5.0 * (r.pelvis[:, 2] - ref.height)[:, None],
-                wrap(ref.heading - yaw)[:, None],
-                r.joints - self._rest,
-                0.05 * r.joint_velocity,
-                self.action,
-                ref.joints.flatten(1) - self._rest[:12],
-                feet.flatten(1),
-                goal.flatten(1),
-                scan.clamp(-1.0, 1.0),
-            ],
-            dim=1,
-        )
-        return reflect(seen, MIRROR, ref.side)
+        r, index = self.robots, MIRROR[0]
+        seen = torch.empty(len(command), len(index))
+        inputs = [
+            ground.maps, self.walker.targets, vec3(command), vec3(r.pelvis), mat33(r.orientation), vec3(r.spin),
+            vec3(r.com_velocity), plain(r.joints), plain(r.joint_velocity), plain(self.action),
+            plain(self.reference.joints.flatten(1)), *self._constants,
+        ]  # fmt: skip
+        wp.launch(observe, len(command), inputs, [plain(seen)], device="cpu")
+        return seen
 
     def snapshot(self, ids: Tensor) -> dict[str, Tensor]:
         """State of robots `ids` and of their gait, before `refer`: what `restore` needs to go on walking."""

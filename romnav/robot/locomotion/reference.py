@@ -66,7 +66,8 @@ class Targets:
 
 
 @wp.func
-def _xy(vector: wp.vec3):
+def xy(vector: wp.vec3):
+    """The horizontal part of a vector."""
     return wp.vec2(vector[0], vector[1])
 
 
@@ -76,7 +77,8 @@ def _about(axis: wp.vec3, angle: float):
 
 
 @wp.func
-def _yaw(rotation: wp.mat33):
+def yaw_of(rotation: wp.mat33):
+    """Heading, rad."""
     return wp.atan2(rotation[1, 0], rotation[0, 0])
 
 
@@ -129,9 +131,9 @@ def swing_sole(gait: Gait, maps: Maps, robot: int, lift: wp.vec3, foothold: wp.v
     way = foothold - lift
     apex = lift[2]
     for k in range(9):
-        apex = wp.max(apex, highest(maps, robot, _xy(lift + (1.4 * float(k) / 8.0 - 0.1) * way), reach))
+        apex = wp.max(apex, highest(maps, robot, xy(lift + (1.4 * float(k) / 8.0 - 0.1) * way), reach))
     apex += gait.clearance
-    across = _xy(lift) + _xy(way) * smoothstep((t - 0.1) / (gait.swing_across - 0.1))
+    across = xy(lift) + xy(way) * smoothstep((t - 0.1) / (gait.swing_across - 0.1))
     height = lift[2] + (apex - lift[2]) * smoothstep(t / 0.45)
     if t >= 0.5:
         height = apex + (foothold[2] - apex) * smoothstep((t - 0.55) / 0.45)
@@ -201,16 +203,16 @@ def refer(
     state.landed[robot] = landed
     stand = targets.sole[robot, stance] if landed else state.planted[robot]
     reach = stand[2] + 0.5
-    under = highest(maps, robot, _xy(targets.sole[robot, stance]), reach)
-    under_swing = highest(maps, robot, _xy(targets.sole[robot, 1 - stance]), reach)
+    under = highest(maps, robot, xy(targets.sole[robot, stance]), reach)
+    under_swing = highest(maps, robot, xy(targets.sole[robot, 1 - stance]), reach)
     mean = (under + under_swing) / 2.0
     if start:
         state.base[robot] = mean
     base = state.base[robot]
 
     rotation = body[robot]
-    yaw = _yaw(rotation)
-    rate = _xy(com_velocity[robot])
+    yaw = yaw_of(rotation)
+    rate = xy(com_velocity[robot])
     velocity = turned(rate, -yaw)
     last = state.foothold[robot]
     level = wp.max(wp.abs(last[2] - base), wp.abs(under - under_swing)) < gait.level or fresh[robot]
@@ -230,23 +232,23 @@ def refer(
     # The pendulum knows neither the body's lag nor turning frames: their constant errors are integrated away,
     # but not where the integral would wind up: held by a wall, and on stairs, where treads bound the steps. There,
     # who loses its speed steps back down to regain it, and falls: it aims at a little more.
-    integral = integrate(gait, state.integral[robot], _xy(command) - velocity, level and not held)
+    integral = integrate(gait, state.integral[robot], xy(command) - velocity, level and not held)
     state.integral[robot] = integral
-    speed = orbit_velocity(gait, _xy(command), integral, level)
+    speed = orbit_velocity(gait, xy(command), integral, level)
 
     # Foothold: the divergent component at touch-down, less the periodic gait's offset, within reach.
     left = (1.0 - done) * gait.duration - gait.early
-    x = _xy(com[robot]) - _xy(stand)
+    x = xy(com[robot]) - xy(stand)
     xi = (x + rate / gait.w) * wp.exp(gait.w * left)
     landing = facing + command[2] * left
     step = turned(xi, -landing) - capture_offset(gait, speed, -on)
     ahead = wp.clamp(step[0], gait.reach_forward[0], gait.reach_forward[1])
     beside = wp.clamp(-on * step[1], gait.reach_side[0], gait.reach_side[1])
-    aim = _xy(stand) + turned(wp.vec2(ahead, -on * beside), landing)
+    aim = xy(stand) + turned(wp.vec2(ahead, -on * beside), landing)
     aim = clear_of_edges(gait, maps, robot, aim, landing, reach, under)
     # Late corrections would drag the foot over an edge, early ones are noise amplified by exp(w t).
     blend = 1.0 if start else 0.4
-    next = _xy(last) + blend * (aim - _xy(last))
+    next = xy(last) + blend * (aim - xy(last))
     place = wp.vec3(next[0], next[1], highest(maps, robot, next, reach))
     state.foothold[robot] = place
     foot = swing_sole(gait, maps, robot, state.lift[robot], place, done, reach)
@@ -266,13 +268,13 @@ def refer(
     upright = gait.upright_gain * wp.vec2(rotation[2, 0], rotation[2, 1])
     for i in range(2):
         if i == stance:
-            lies = lying(maps, robot, _xy(stand), _yaw(ankle_rotation[robot, i]), reach)
+            lies = lying(maps, robot, xy(stand), yaw_of(ankle_rotation[robot, i]), reach)
             frame = wp.transpose(_about(_Z, facing) * _about(_Y, upright[0]) * _about(_X, -upright[1]))
             hip = wp.vec3(is_at[0] + pull[0], is_at[1] + pull[1], tall)
             targets.ankle[robot, i] = frame * (stand - lies * _SOLE - hip)
             targets.ankle_rotation[robot, i] = frame * lies
         else:
-            lies = lying(maps, robot, _xy(place), landing, reach)
+            lies = lying(maps, robot, xy(place), landing, reach)
             frame = wp.transpose(rotation)
             targets.ankle[robot, i] = frame * (foot - lies * _SOLE - is_at)
             targets.ankle_rotation[robot, i] = frame * lies

@@ -18,8 +18,8 @@ from romnav.robot.locomotion.lip import gait_of
 from romnav.robot.locomotion.reference import State, Targets, refer
 from romnav.robot.spec import GaitSpec
 
-_plain = partial(wp.from_torch, return_ctype=True)
-_vec2, _vec3, _mat33 = (partial(_plain, dtype=dtype) for dtype in (wp.vec2, wp.vec3, wp.mat33))
+plain = partial(wp.from_torch, return_ctype=True)
+vec3, mat33 = (partial(plain, dtype=dtype) for dtype in (wp.vec3, wp.mat33))
 
 
 @dataclass
@@ -64,7 +64,7 @@ class Walker:
 
     Attributes:
         gait: the specification, for kernels.
-        reference: of the last control step.
+        reference, targets: of the last control step; the latter for kernels.
     """
 
     STATE = ("clock", "lift", "foothold", "planted", "landed", "base", "heading", "command", "integral", "joints")
@@ -91,7 +91,7 @@ class Walker:
         )  # fmt: skip
         self._state = _struct(State, vars(self))
         ankles = {"ankle": self._ankle, "ankle_rotation": self._ankle_rotation}
-        self._targets = _struct(Targets, vars(self.reference) | ankles)
+        self.targets = _struct(Targets, vars(self.reference) | ankles)
 
     def stance(self) -> Tensor:
         """Leg joints (1, 2, 6) of standing at the nominal height with the feet apart."""
@@ -127,11 +127,11 @@ class Walker:
         """
         r = robots
         inputs = [
-            self.gait, ground.maps, _vec3(command), _plain(first), r.mass, _vec3(r.pelvis), _mat33(r.orientation),
-            _vec3(r.velocity), _vec3(r.com), _vec3(r.com_velocity), _vec3(r.ankle), _mat33(r.ankle_rotation),
-            _vec3(r.anchor), _vec3(r.axis), _plain(r.touch), wp.vec2i(r.feet),
+            self.gait, ground.maps, vec3(command), plain(first), r.mass, vec3(r.pelvis), mat33(r.orientation),
+            vec3(r.velocity), vec3(r.com), vec3(r.com_velocity), vec3(r.ankle), mat33(r.ankle_rotation),
+            vec3(r.anchor), vec3(r.axis), plain(r.touch), wp.vec2i(r.feet),
         ]  # fmt: skip
-        wp.launch(refer, len(command), inputs, [self._state, self._targets], device="cpu")
+        wp.launch(refer, len(command), inputs, [self._state, self.targets], device="cpu")
         self.joints.copy_(self.legs.inverse(self._ankle, self._ankle_rotation, self.joints))
         return self.reference
 
