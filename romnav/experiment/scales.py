@@ -100,7 +100,7 @@ class ScaleFile:
         known = {file.stem: file for file in folder.glob("*.toml")}
         if name not in known:
             raise RomnavError(f"unknown scale {name}{suggest(name, known)}")
-        file = known[name]
+        self._file = file = known[name]
         self.name = name
         self._data = read_toml(file)
         self._bodies = parse(Scale, self._data, file).bodies
@@ -116,7 +116,7 @@ class ScaleFile:
     def of_body(self, body: str) -> Scale:
         """The settings of a body that no arm changes."""
         change = {"navigation": {"dynamics": body}}
-        return Scale.model_validate(_merge(self._on_its_body(change), change))
+        return parse(Scale, _merge(self._on_its_body(change), change), self._file)
 
     def changed(self, name: str, experiment: Experiment, file: Path) -> Scale:
         """The settings of arm ``name`` of the ``experiment`` in ``file``.
