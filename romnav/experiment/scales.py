@@ -83,9 +83,9 @@ class Scale(Config):
                 )
         return self
 
-    def on_body(self, dynamics: str, stair_speed: float | None = None) -> Scale:
+    def on_body(self, own: NavigationSpec) -> Scale:
         """The same with robots of another body."""
-        other = {"dynamics": dynamics, "stair_speed": stair_speed}
+        other = {"dynamics": own.dynamics, "stair_limits": own.stair_limits}
         return self.model_copy(update={"navigation": self.navigation.model_copy(update=other)})
 
 
@@ -100,7 +100,7 @@ class ScaleFile:
         known = {file.stem: file for file in folder.glob("*.toml")}
         if name not in known:
             raise RomnavError(f"unknown scale {name}{suggest(name, known)}")
-        file = known[name]
+        self._file = file = known[name]
         self.name = name
         self._data = read_toml(file)
         self._bodies = parse(Scale, self._data, file).bodies
@@ -112,6 +112,11 @@ class ScaleFile:
             if parse(Scale, _merge(driven, change), file, f"{key}.").navigation.dynamics != body:
                 raise RomnavError(f"{file}: {key}.navigation.dynamics: it is {body} here; leave it out")
         self.settings = parse(Scale, self._on_its_body(), file)
+
+    def of_body(self, body: str) -> Scale:
+        """The settings of a body that no arm changes."""
+        change = {"navigation": {"dynamics": body}}
+        return parse(Scale, _merge(self._on_its_body(change), change), self._file)
 
     def changed(self, name: str, experiment: Experiment, file: Path) -> Scale:
         """The settings of arm ``name`` of the ``experiment`` in ``file``.

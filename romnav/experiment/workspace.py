@@ -31,6 +31,10 @@ class Workspace:
         """The settings of the scale."""
         return self._file.settings
 
+    def body_settings(self, body: str) -> Scale:
+        """The scale's settings for a body."""
+        return self._file.of_body(body)
+
     def arm_settings(self, arm: str) -> Scale:
         """The scale's settings with the changes of a trained arm.
 

@@ -249,9 +249,9 @@ class NavigationSpec(Config):
     dynamics: Annotated[str, BODIES] = "rom"
     """The body that is driven: the reduced-order model, "g1", the humanoid under its frozen locomotion policy, or one
     from outside, "pkg.mod:Name"."""
-    stair_speed: Positive | None = Field(default=None, exclude_if=lambda limit: limit is None)
-    """Fastest forward command that the humanoid follows while its next foothold is not level with its feet, m/s (A:
-    none, as in the paper)."""
+    stair_limits: tuple[Positive, Positive] | None = Field(default=None, exclude_if=lambda limits: limits is None)
+    """Fastest forward command, m/s, and turn, rad/s, that the humanoid follows while its next foothold is not level
+    with its feet (A: none, as in the paper)."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""
@@ -262,9 +262,9 @@ class NavigationSpec(Config):
 
     @model_validator(mode="after")
     def _has_minibatches(self) -> Self:
-        if self.stair_speed is not None and self.dynamics != "g1":
+        if self.stair_limits is not None and self.dynamics != "g1":
             raise ValueError(
-                f"stair_speed: {self.dynamics} has no feet to be slow with; set dynamics to g1, or leave it"
+                f"stair_limits: {self.dynamics} has no feet to be slow with; set dynamics to g1, or leave it"
             )
         if self.ppo.minibatches > self.env.envs:
             raise ValueError(

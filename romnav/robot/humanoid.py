@@ -84,7 +84,7 @@ class Humanoid:
         *,
         seed: int = 0,
         threads: int = 0,
-        stair_speed: float | None = None,
+        stair_limits: tuple[float, float] | None = None,
         first: int = 0,
     ) -> None:
         """
@@ -96,14 +96,15 @@ class Humanoid:
             gaits: recorded from it.
             seed: of first feet and times along gaits.
             threads: of the physics; 0 means all cores. They do not change the result.
-            stair_speed: fastest forward command followed while the next foothold is not level with the feet, m/s.
+            stair_limits: fastest forward command, m/s, and turn, rad/s, followed while the next foothold is not level
+                with the feet.
             first: number of the first robot, where those before it are elsewhere; what is drawn depends on numbers.
 
         Raises:
             RomnavError: the checkpoint is missing, or the period is no multiple of the control step.
         """
         self.world, self.period, self.gaits, self.seed = world, period, gaits, seed
-        self.stair_speed = stair_speed
+        self.stair_limits = stair_limits
         self._spec, self._policy, _ = load_policy(checkpoint)
         self._heights = TileHeights(world.tiles)
         self.tile = torch.zeros(envs, dtype=torch.int64)
@@ -241,12 +242,14 @@ class Humanoid:
 
     def _followed(self, command: Tensor) -> Tensor:
         """Commands (E, 3), slower on stairs if there is a limit."""
-        if self.stair_speed is None:
+        if self.stair_limits is None:
             return command
+        forward, turn = self.stair_limits
         walker = self.control.walker
         steep = ((walker.foothold[:, 2] - walker.base).abs() > self._spec.gait.level) & ~self._first
         slow = command.clone()
-        slow[:, 0] = command[:, 0].clamp(max=self.stair_speed)
+        slow[:, 0] = command[:, 0].clamp(max=forward)
+        slow[:, 2] = command[:, 2].clamp(-turn, turn)
         return torch.where(steep[:, None], slow, command)
 
     def _read(self) -> None:

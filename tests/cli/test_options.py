@@ -52,7 +52,7 @@ def test_the_version_is_told() -> None:
         ("romnav train policy u", {"uniform", "uniform-nocap", "unfrozen"}),
         ("romnav run ablation sp", {"spawn-goal"}),
         ("romnav results --scale c", {"cpu"}),
-        ("romnav eval or", {"oracle", "oracle-hum", "oracle-hum-slow"}),
+        ("romnav eval or", {"oracle", "oracle-hum", "oracle-hum-free", "oracle-hum-limited"}),
     ],
 )
 def test_the_shell_completes_names(project: Path, words: str, names: set[str]) -> None:

@@ -191,6 +191,7 @@ BODIES = """
 env.envs = 9
 env.command.forward = 0.75
 ppo.iterations = 3
+stair_limits = [0.4, 0.5]
 """
 
 
@@ -206,6 +207,9 @@ def test_an_arm_on_another_body_begins_with_the_settings_of_that_body(scales: Pa
     assert found["rom"] == plain.settings.navigation == scale.settings.navigation
     assert (found["hum"].env.envs, found["hum"].ppo.iterations, found["hum"].env.command.forward) == (9, 3, 0.75)
     assert found["hum"].env.duration == 20.0  # the scale's
+    assert scale.of_body("g1").navigation == found["hum"]
+    assert scale.of_body("rom").navigation == scale.settings.navigation
+    assert scale.settings.on_body(found["hum"]).navigation.stair_limits == (0.4, 0.5)
     assert (found["slow"].env.envs, found["slow"].env.command.forward) == (9, 0.5)  # the arm's own change comes last
     at_scale = parse(Experiment, tomllib.loads(text + "[scales.smoke.navigation.env]\nenvs = 10\n"), Path("e.toml"))
     assert scale.changed("hum", at_scale, Path("e.toml")).navigation.env.envs == 10

@@ -227,7 +227,7 @@ def test_who_has_fallen_is_reported_and_stays_down(world: World, checkpoint: Pat
 
 
 def test_a_limit_on_stairs_slows_who_steps_up_or_down_and_nobody_else(world: World, checkpoint: Path) -> None:
-    body = Humanoid(world, 3, 0.2, checkpoint, GaitLibrary([]), threads=1, stair_speed=0.4)
+    body = Humanoid(world, 3, 0.2, checkpoint, GaitLibrary([]), threads=1, stair_limits=(0.4, 0.3))
     body.reset(torch.arange(3), starts(world, level_nodes(world, 3), torch.zeros(3)))
     command = torch.tensor([[0.8, 0.1, 0.5], [0.8, 0.1, 0.5], [-0.3, 0.1, 0.5]])
     assert torch.equal(body._followed(command), command)
@@ -236,8 +236,8 @@ def test_a_limit_on_stairs_slows_who_steps_up_or_down_and_nobody_else(world: Wor
     followed = body._followed(command)
     assert followed.tolist() == [
         command[0].tolist(),
-        [torch.tensor(0.4).item(), *command[1, 1:].tolist()],
-        command[2].tolist(),
+        torch.tensor([0.4, 0.1, 0.3]).tolist(),
+        torch.tensor([-0.3, 0.1, 0.3]).tolist(),
     ]
 
 

@@ -46,16 +46,15 @@ class Driven:
         trained = None if script else policy(work, arm, seed)
         settings = work.arm_settings(driver) if trained else work.settings
         if arm not in SCRIPTED and (script or driver != arm):
-            own = work.arm_settings(arm).navigation
-            settings = settings.on_body(own.dynamics, own.stair_speed)
+            settings = settings.on_body(work.arm_settings(arm).navigation)
         return cls(work, arm, seed if trained else 0, trained, settings)
 
     @property
     def uses(self) -> tuple[str, ...]:
         """Settings that tell rows apart beside those of the policy."""
         body: tuple[str, ...] = ("navigation.dynamics",)
-        if self.settings.navigation.stair_speed is not None:
-            body += ("navigation.stair_speed",)
+        if self.settings.navigation.stair_limits is not None:
+            body += ("navigation.stair_limits",)
         if self.policy is None:
             return (*body, "navigation.env")
         return body if self.policy.arm != self.arm else ()

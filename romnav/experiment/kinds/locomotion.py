@@ -140,6 +140,6 @@ def humanoid(
         gaits=GaitLibrary.load(gaits(work).folder / "gaits.pt"),
         seed=seed,
         threads=threads,
-        stair_speed=settings.navigation.stair_speed,
+        stair_limits=settings.navigation.stair_limits,
         first=ranks.share(settings.navigation.env.envs).start,
     )

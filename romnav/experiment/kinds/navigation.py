@@ -18,7 +18,9 @@ from romnav.progress import Progress
 
 def navigation(work: Workspace) -> Stage:
     """Falls by place while the oracle and `rom` drive the humanoid over the `dev` episodes."""
-    drivers = [replace(driven, settings=driven.settings.on_body("g1")) for driven in _drivers(work)]
+    own = work.body_settings("g1").navigation
+    drivers = [replace(driven, settings=driven.settings.on_body(own)) for driven in _drivers(work)]
+    limits = ("navigation.stair_limits",) if own.stair_limits else ()
     rom, walked = drivers[-1], locomotion(work)
     return Stage(
         kind="navigation",
@@ -27,7 +29,7 @@ def navigation(work: Workspace) -> Stage:
         outputs=("navigation.json",),
         record=walked.folder / "navigation-record.json",
         settings=rom.settings,
-        uses=("navigation.env", "evaluation.duration", "evaluation.reach"),
+        uses=("navigation.env", *limits, "evaluation.duration", "evaluation.reach"),
         make=partial(_count, drivers),
         reads=(_episodes(work),),
         upstream=rom.upstream,
