@@ -34,12 +34,11 @@ PARTS = {
     "physics": ("step", "mujoco._batch"),
     "surroundings": ("_surround", "g1.py"),
     "reference gait, with": ("update", "walker.py"),
-    "heights of the ground": ("__call__", "heights.py"),
     "inverse kinematics": ("inverse", "legs.py"),
     "observation": ("observe", "control.py"),
     "policy": ("policy", "train.py"),
 }
-"""Functions whose time is told, by name and a part of their file's; heights are asked for by observations, too."""
+"""Functions whose time is told, by name and a part of their file's."""
 _NODE, _HEADING, _COMMAND = range(3)
 
 
@@ -126,8 +125,7 @@ def shares(walk: Walk) -> dict[str, float]:
         name: sum(row[3] for (file, _, function), row in rows.items() if where in file + function and what in function)
         for name, (what, where) in PARTS.items()
     }
-    within = ("heights of the ground", "inverse kinematics")
-    rest = total - sum(seconds for name, seconds in found.items() if name not in within)
+    rest = total - sum(seconds for name, seconds in found.items() if name != "inverse kinematics")
     return {name: seconds / total for name, seconds in (found | {"everything else": rest}).items()}
 
 
