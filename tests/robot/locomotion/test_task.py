@@ -16,6 +16,7 @@ from romnav.robot.heights import HeightMap
 from romnav.robot.locomotion.control import Controller, has_fallen
 from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
 from romnav.robot.locomotion.lane_task import LocomotionEnv
+from romnav.robot.locomotion.legs import rotation
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR
 from romnav.robot.locomotion.planar import turn_xy
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
