@@ -155,6 +155,8 @@ class RewardSpec(Config):
     """exp(-(e / 0.4)^2) of the averaged yaw rate."""
     upright: NonNegative = 1.5
     """Penalty on the horizontal part of gravity, squared."""
+    torso: NonNegative = Field(default=0.0, exclude_if=lambda weight: weight == 0.0)
+    """The same of the torso, which carries the sensors: where it leans forward they see little but the ground."""
     action: NonNegative = 0.01
     """Penalty on the sum of squared actions."""
     action_rate: NonNegative = 0.01

@@ -193,6 +193,7 @@ class WalkingEnv(VecEnv):
             "velocity_linear": -w.velocity_linear * error,
             "yaw": w.yaw * turning,
             "upright": -w.upright * r.orientation[:, 2, :2].square().sum(1),
+            "torso": -w.torso * r.torso_rotation[:, 2, :2].square().sum(1),
             "action": -w.action * self.control.action.square().sum(1),
             "action_rate": -w.action_rate * (self.control.action - self._last["action"]).square().sum(1),
             "torque": -w.torque * r.torque.square().sum(1),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,13 @@ from romnav.robot.heights import HeightMap
 from romnav.robot.locomotion.control import Controller, has_fallen
 from romnav.robot.locomotion.evaluate import Cycles, Row, rows, run_row
 from romnav.robot.locomotion.lane_task import LocomotionEnv
+from romnav.robot.locomotion.legs import rotation
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR
 from romnav.robot.locomotion.planar import turn_xy
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
-from romnav.robot.spec import LaterMixSpec, LocomotionSpec, PpoSpec, TaskSpec, TileTaskSpec
+from romnav.robot.spec import LaterMixSpec, LocomotionSpec, PpoSpec, RewardSpec, TaskSpec, TileTaskSpec
 from romnav.robot.statics import Geoms
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
@@ -59,6 +61,14 @@ def test_the_mirrored_robot_sees_the_same_and_does_the_mirror_image() -> None:
         torch.testing.assert_close(seen[1:], seen[:1], atol=2e-2, rtol=0)
         control.act((0.3 * torch.randn(1, 15, generator=generator)).expand(2, -1))
     assert (env.robots.pelvis[0] * torch.tensor([1, -1, 1]) - env.robots.pelvis[1]).abs().max() < 2e-3
+
+
+def test_a_torso_that_leans_costs_whichever_way() -> None:
+    spec = SPEC.model_copy(update={"reward": RewardSpec(torso=2.0)})
+    env = LocomotionEnv(spec, lanes(), threads=1)
+    for turn in (rotation(1, torch.tensor(0.3)), rotation(0, torch.tensor(-0.3))):
+        env.robots.torso_rotation = turn.expand(8, 3, 3)
+        assert env.rewards()["torso"].numpy() == pytest.approx(-2.0 * math.sin(0.3) ** 2)
 
 
 def test_spinning_on_the_spot_earns_less_than_walking() -> None:
