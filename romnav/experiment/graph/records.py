@@ -109,7 +109,9 @@ def _whole(stage: Stage, record: Record) -> bool:
 
 
 def _read_what_is_there(stage: Stage, record: Record) -> bool:
-    """Whether the upstream outputs are those that were read; records tell, the files may be gone."""
+    """Whether all upstream outputs were read, and are those that were; records tell, the files may be gone."""
+    if not record.upstream.keys() >= {above.name for above in stage.upstream}:
+        return False  # a report of what there was
     for above in stage.upstream:
         other = read(above)
         if other is None or not other.outputs:

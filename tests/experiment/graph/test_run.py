@@ -397,6 +397,21 @@ def test_a_device_that_is_not_there_is_one_clear_error() -> None:
         Session("cdua")
 
 
+def test_a_report_that_was_drawn_without_an_arm_is_not_finished(tmp_path: Path) -> None:
+    """By `romnav tables`; `run` then still makes the arm."""
+    arms = build(tmp_path, (set(), set(), {0, 1}), Settings())
+    run(arms[:1])
+
+    def draw(report: Stage, session: Session, progress: Any) -> dict[str, Any]:
+        return write(replace(report, upstream=report.upstream[:1]), session, progress)
+
+    execute([replace(arms[2], make=draw)], Session())
+    assert records.drawn(arms[2])
+    assert not records.finished(arms[2])
+    assert run(arms[2:]) == ["b", "c"]
+    assert records.finished(arms[2])
+
+
 def test_a_report_is_drawn_again_when_what_it_shows_has_changed_and_not_before(chain: list[Stage]) -> None:
     run(chain)
     folder = chain[0].folder.parent
