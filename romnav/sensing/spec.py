@@ -144,8 +144,8 @@ class SwaySpec(Config):
 
 
 UPRIGHT = SwaySpec()
-WALKING = SwaySpec(roll=(-0.2, 0.2), pitch=(0.1, 0.55), sink=(0.05, 0.25))
-"""As measured over the gait library of the `cpu` scale, 1st to 99th percentile: knees are bent and the torso leans."""
+WALKING = SwaySpec(roll=(-0.2, 0.2), pitch=(-0.25, 0.25), sink=(0.05, 0.2))
+"""As measured while the `cpu` scale's `rom` drove 96 humanoids for 1,280 steps, 1st to 99th percentile."""
 
 
 class PretrainSpec(Config):
