@@ -213,9 +213,17 @@ class TaskSpec(Config):
         return shares
 
 
-class TileMixSpec(Config):
-    """What robots on tiles are asked for (A)."""
+class TileTaskSpec(Config):
+    """Locomotion as navigation asks for it: robots among the walls and stairs of tiles, commanded at 5 Hz (A)."""
 
+    robots: Robots = 0
+    """Robots on tiles, besides those on lanes."""
+    begin: int = Field(default=0, ge=0, le=2**31 - 1)
+    """Iterations before they join: until then the run is one without them."""
+    world: WorldSpec = WorldSpec(tiles=48, side=20.0, goals_per_tile=32, classes=("building", "outdoor", "building"))
+    """The tiles, small: walking needs no long ways, and classes without stairs teach little that lanes do not."""
+    period: Positive = 0.2
+    """Time for which a command is held, s (P: navigation's)."""
     drivers: dict[str, Share] = Field(default={"steps": 0.15, "smooth": 0.15, "oracle": 0.7})
     """Share of the episodes under commands that are drawn over the whole limits and held, under such that wander
     through them, and under the shortest path to a goal."""
@@ -242,38 +250,6 @@ class TileMixSpec(Config):
         if drivers.keys() != set(DRIVERS) or not sum(drivers.values()):
             raise ValueError(f"{drivers}; give a share to each of {', '.join(DRIVERS)}, not all of them 0")
         return drivers
-
-
-class LaterMixSpec(TileMixSpec):
-    """What they are asked for later."""
-
-    begin: Count
-    """Iterations before it."""
-
-
-class TileTaskSpec(TileMixSpec):
-    """Locomotion as navigation asks for it: robots among the walls and stairs of tiles, commanded at 5 Hz (A)."""
-
-    robots: Robots = 0
-    """Robots on tiles, besides those on lanes."""
-    begin: int = Field(default=0, ge=0, le=2**31 - 1)
-    """Iterations before they join: until then the run is one without them."""
-    world: WorldSpec = WorldSpec(tiles=48, side=20.0, goals_per_tile=32, classes=("building", "outdoor", "building"))
-    """The tiles, small: walking needs no long ways, and classes without stairs teach little that lanes do not."""
-    period: Positive = 0.2
-    """Time for which a command is held, s (P: navigation's)."""
-    later: LaterMixSpec | None = Field(default=None, exclude_if=lambda later: later is None)
-    """What they are asked for from some iteration on: a run that is not there yet goes on with it."""
-
-    def mix(self, iteration: int) -> TileMixSpec:
-        """What they are asked for in an iteration, counted from 1."""
-        return self.later if self.later and iteration > self.later.begin else self
-
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        if self.later and self.later.begin <= self.begin:
-            raise ValueError(f"later.begin: {self.later.begin} is not after the robots join at {self.begin} (begin)")
-        return self
 
 
 class PpoSpec(Config):

@@ -11,7 +11,7 @@ from romnav.robot.g1 import Humanoids
 from romnav.robot.heights import TileHeights
 from romnav.robot.locomotion.planar import heading_of
 from romnav.robot.locomotion.task import WalkingEnv
-from romnav.robot.spec import DRIVERS, LocomotionSpec, TileMixSpec
+from romnav.robot.spec import DRIVERS, LocomotionSpec
 from romnav.robot.tiles import change_layer, geoms
 from romnav.world.geodesic import UNIT
 from romnav.world.lookup import GeodesicLookup
@@ -49,7 +49,8 @@ class TileEnv(WalkingEnv):
         self._lookup = GeodesicLookup(world)
         self._starts = [_starts(world, k) for k in range(len(world.tiles))]
         self._hold = round(t.period / self.dt)
-        self.ask(t)
+        shares = torch.tensor([t.drivers[driver] for driver in DRIVERS])
+        self._chances = shares.cumsum(0) / sum(t.drivers.values())
         self.layer = torch.zeros(n, dtype=torch.long)
         self.goal = torch.zeros(n, dtype=torch.long)
         self.driver = torch.zeros(n, dtype=torch.long)
@@ -59,14 +60,8 @@ class TileEnv(WalkingEnv):
         self.stray = torch.zeros(n)
         self._begin()
 
-    def ask(self, mix: TileMixSpec) -> None:
-        """What robots are asked for from now on; what is drawn for an episode is that of its beginning."""
-        self._mix = mix
-        shares = torch.tensor([mix.drivers[driver] for driver in DRIVERS])
-        self._chances = shares.cumsum(0) / sum(mix.drivers.values())
-
     def _start(self, ids: Tensor) -> tuple[Tensor, Tensor]:
-        t, world, k = self._mix, self.world, len(ids)
+        t, world, k = self.spec.tiles, self.world, len(ids)
         u = self._uniform(0.0, 1.0, k)
         kind = torch.where(u < t.mouth, 0, torch.where(u < t.mouth + t.wall, 1, 2))
         draws = self._uniform(0.0, 1.0, 3 * k).reshape(3, k)
@@ -106,11 +101,11 @@ class TileEnv(WalkingEnv):
 
     def _ticks(self, k: int) -> Tensor:
         """(k,) ticks for which to hold drawn commands."""
-        low, high = self._mix.hold
+        low, high = self.spec.tiles.hold
         return ((low + (high - low) * self._uniform(0.0, 1.0, k).square()) / self.dt).long()
 
     def _drive(self) -> None:
-        t, r = self._mix, self.robots
+        t, r = self.spec.tiles, self.robots
         low = self.control.walker.soles(r)[..., 2].amin(1)
         xy = r.pelvis[:, :2]
         self.layer = change_layer(self.world, self.tile, self.layer, xy, self.heights(xy, low + STEP_UP))

@@ -26,7 +26,7 @@ from romnav.robot.locomotion.lane_task import LocomotionEnv
 from romnav.robot.locomotion.task import WalkingEnv
 from romnav.robot.locomotion.terrain import curriculum
 from romnav.robot.locomotion.tile_task import TileEnv
-from romnav.robot.spec import LocomotionSpec, PpoSpec, TileMixSpec, TileTaskSpec
+from romnav.robot.spec import LocomotionSpec, PpoSpec, TileTaskSpec
 from romnav.tensors import Kind, not_finite, require_finite
 from romnav.world.build import build
 
@@ -38,17 +38,11 @@ class Together(VecEnv):
     """Robots on lanes and, from some iteration on, on tiles, as one batch."""
 
     def __init__(self, lanes: LocomotionEnv, tiles: TileEnv | None = None) -> None:
-        self._tiles = tiles
         self.parts: list[WalkingEnv] = [lanes, *([tiles] if tiles else [])]
         self.cfg, self.num_actions, self.device = lanes.cfg, lanes.num_actions, "cpu"
         self.max_episode_length = lanes.max_episode_length
         self._counts = [part.num_envs for part in self.parts]
         self.num_envs = sum(self._counts)
-
-    def ask(self, mix: TileMixSpec) -> None:
-        """What robots on tiles are asked for from now on."""
-        if self._tiles:
-            self._tiles.ask(mix)
 
     def get_observations(self) -> TensorDict:
         """Observation groups of all robots."""
@@ -257,7 +251,6 @@ def train(
                 env = joined()
                 obs = env.get_observations()
                 ppo.storage = RolloutStorage("rl", env.num_envs, spec.ppo.steps, obs, [env.num_actions])
-            env.ask(spec.tiles.mix(iteration))
             rows: list[dict[str, float]] = []
             total, clock = 0.0, time.monotonic()
             with torch.inference_mode():
@@ -310,8 +303,6 @@ def _until(spec: LocomotionSpec, iteration: int) -> LocomotionSpec:
     tiles = spec.tiles
     if tiles.robots == 0 or iteration <= tiles.begin:
         tiles = TileTaskSpec()
-    elif tiles.later and iteration <= tiles.later.begin:
-        tiles = tiles.model_copy(update={"later": None})
     return spec.model_copy(update={"iterations": 1, "tiles": tiles})
 
 

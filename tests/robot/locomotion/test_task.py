@@ -22,7 +22,7 @@ from romnav.robot.locomotion.planar import turn_xy
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
-from romnav.robot.spec import LaterMixSpec, LocomotionSpec, PpoSpec, RewardSpec, TaskSpec, TileTaskSpec
+from romnav.robot.spec import LocomotionSpec, PpoSpec, RewardSpec, TaskSpec, TileTaskSpec
 from romnav.robot.statics import Geoms
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
@@ -169,17 +169,13 @@ def test_rows_behind_the_checkpoint_are_not_there_twice(tmp_path: Path) -> None:
 
 
 def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Path) -> None:
-    """Across the iteration at which they join, from a checkpoint of the specification without them, and across that at
-    which they are asked for something else, from one of the specification without that."""
+    """Across the iteration at which they join, from a checkpoint of the specification without them."""
     world = WorldSpec(tiles=2, goals_per_tile=4, classes=("building", "outdoor"))
-    joined = TileTaskSpec(robots=4, begin=1, world=world)
-    drivers = {"steps": 1.0, "smooth": 0.0, "oracle": 0.0}
-    tiles = joined.model_copy(update={"later": LaterMixSpec(begin=2, drivers=drivers, hold=(0.2, 0.2))})
+    tiles = TileTaskSpec(robots=4, begin=1, world=world)
     spec = SPEC.model_copy(update={"tiles": tiles, "iterations": 3})
     whole = train(spec, tmp_path / "whole", threads=1, worlds=tmp_path)
     train(SPEC.model_copy(update={"iterations": 1}), tmp_path / "parts", threads=1)
-    before = SPEC.model_copy(update={"tiles": joined, "iterations": 2})
-    train(before, tmp_path / "parts", threads=1, worlds=tmp_path)
+    train(spec.model_copy(update={"iterations": 2}), tmp_path / "parts", threads=1, worlds=tmp_path)
     parts = train(spec, tmp_path / "parts", threads=2, worlds=tmp_path)
     a, b = (KIND.load(path) for path in (whole, parts))
     for key, value in a["ppo"]["actor_state_dict"].items():
@@ -191,24 +187,9 @@ def test_robots_join_on_tiles_and_the_run_still_resumes_to_the_bit(tmp_path: Pat
     assert len(lines) == 4
     assert len({len(line) for line in lines}) == 1
     assert spec.steps(3) == 6 * (3 * 8 + 2 * 4)
-    for other in (SPEC, before):
+    for other in (TileTaskSpec(), tiles.model_copy(update={"burst": 0.5})):
         with pytest.raises(RomnavError, match="another specification"):
-            train(other.model_copy(update={"iterations": 4}), tmp_path / "parts", threads=1)
-
-
-def test_what_robots_on_tiles_are_asked_for_changes_where_it_is_said(tmp_path: Path) -> None:
-    world = build(WorldSpec(tiles=2, goals_per_tile=4, classes=("building", "outdoor")), tmp_path)
-    drawn, led = {"steps": 1.0, "smooth": 0.0, "oracle": 0.0}, {"steps": 0.0, "smooth": 0.0, "oracle": 1.0}
-    tiles = TileTaskSpec(robots=8, begin=3, drivers=drawn, later=LaterMixSpec(begin=5, drivers=led))
-    assert [tiles.mix(k).drivers["oracle"] for k in (1, 5, 6)] == [0.0, 0.0, 1.0]
-    env = TileEnv(SPEC.model_copy(update={"tiles": tiles}), world, threads=1)
-    assert not env._named("oracle").any()
-    env.ask(tiles.mix(6))
-    assert not env._named("oracle").any(), "episodes end as they have begun"
-    env._place(torch.arange(8))
-    assert env._named("oracle").all()
-    with pytest.raises(ValueError, match=r"later\.begin: 3 is not after the robots join at 3"):
-        TileTaskSpec(robots=8, begin=3, later=LaterMixSpec(begin=3))
+            train(spec.model_copy(update={"tiles": other}), tmp_path / "parts", threads=1)
 
 
 def test_commands_on_tiles_are_held_and_within_the_limits(tmp_path: Path) -> None:
