@@ -148,13 +148,20 @@ class Project:
 
     def overview(self) -> str:
         """Experiments, arms, and the training seeds evaluated at each scale, as text."""
+        listed = {name: self._listed(name) for name in self.experiments}
+        widths = [max((len(row[k]) for rows in listed.values() for row in rows), default=0) for k in (0, 1)]
         lines = []
         for name, experiment in self.experiments.items():
             lines.append(f"{name}: {experiment.title} ({experiment.kind})")
-            labels = [*((arm, spec.label) for arm, spec in experiment.arms.items())]
-            labels += [(arm, "(scripted)") for arm in SCRIPTED if experiment.declared(name, PAIRED).tables]
-            lines += [f"  {arm:<16} {label:<22} {self._evaluated(arm)}".rstrip() for arm, label in labels]
+            for arm, label in listed[name]:
+                lines.append(f"  {arm:<{widths[0]}}  {label:<{widths[1]}}  {self._evaluated(arm)}".rstrip())
         return "\n".join(lines)
+
+    def _listed(self, name: str) -> list[tuple[str, str]]:
+        """Arms of an experiment with what to call them, the scripted ones that bound its tables included."""
+        experiment = self.experiments[name]
+        bounds = SCRIPTED if experiment.declared(name, PAIRED).tables else ()
+        return [*experiment.labels.items(), *((arm, "(scripted)") for arm in bounds)]
 
     def _evaluated(self, arm: str) -> str:
         found: dict[str, list[int]] = {}

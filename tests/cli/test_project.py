@@ -15,6 +15,17 @@ def test_list_names_experiments_arms_and_what_is_evaluated(evaluated: Path) -> N
     assert ["uniform-nocap", "UniformNoCap"] in [line.split() for line in lines]
 
 
+def test_columns_of_the_list_are_as_wide_as_their_longest_name(evaluated: Path) -> None:
+    arm = "an-arm-with-a-name-of-many-letters"
+    edit(evaluated / "experiments" / "spawn-goal.toml", "[arms.nocap]", f"[arms.{arm}]")
+    lines = [line for line in romnav("list").stdout.splitlines() if line.startswith("  ")]
+    (named,) = (line for line in lines if arm in line)
+    label, where = named.index("NoCap"), next(line.index("smoke:") for line in lines if "smoke:" in line)
+    assert label > len(f"  {arm}")
+    assert all(line[label - 1] == " " and line[label] != " " for line in lines)
+    assert {line.index("smoke:") for line in lines if "smoke:" in line} == {where}
+
+
 def test_metrics_have_names_units_and_directions(project: Path) -> None:
     lines = romnav("list", "metrics").stdout.splitlines()
     assert "t2g         T2G: mean time to goal over successful episodes (s, lower is better)" in lines
