@@ -40,7 +40,7 @@ def world(
     with bar("world") as progress:
         described = describe_world(at.work, experiment, progress)
     told = described.plain()
-    path = out or at.work.folder / "figures" / f"describe-{experiment}.png"
+    path = at.picture(out, f"describe-{experiment}.png")
     draw_difficulty(described.difficulty.goals, path)
     if as_json:
         typer.echo(json.dumps(told, indent=2))

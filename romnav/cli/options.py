@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from romnav import ranks
+from romnav import files, ranks
 from romnav.errors import RomnavError
 
 if TYPE_CHECKING:
@@ -108,6 +108,16 @@ class AtScale(InProject):
         from romnav.experiment.workspace import Workspace
 
         return Workspace(self.project, self.scale)
+
+    def picture(self, out: Path | None, name: str) -> Path:
+        """The file of a picture, by default among the figures of the scale; its folder is made.
+
+        Raises:
+            RomnavError: It cannot be written.
+        """
+        path = out or self.work.folder / "figures" / name
+        files.prepare(path)
+        return path
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,9 @@ def world(
     from romnav.report.pictures import draw_tile
     from romnav.world.tiles import generate
 
-    path = out or at.work.folder / "figures" / f"world-{seed}-{tile}.png"
-    draw_tile(*generate(at.work.settings.world.model_copy(update={"seed": seed}), tile), path)
+    spec = at.work.settings.world.model_copy(update={"seed": seed})
+    path = at.picture(out, f"world-{seed}-{tile}.png")
+    draw_tile(*generate(spec, tile), path)
     typer.echo(path)
 
 
@@ -33,10 +34,10 @@ def play_locomotion(at: AtScale) -> None:
     from romnav.experiment.kinds.locomotion import locomotion
     from romnav.robot.locomotion.play import curve, strip
 
-    walked, figures = locomotion(at.work).folder, at.work.folder / "figures"
-    for path in strip(walked / "policy.pt", figures):
+    walked, drawn = locomotion(at.work).folder, at.picture(None, "locomotion-curve.png")
+    for path in strip(walked / "policy.pt", drawn.parent):
         typer.echo(path)
-    typer.echo(curve(walked / "curve.csv", figures / "locomotion-curve.png"))
+    typer.echo(curve(walked / "curve.csv", drawn))
 
 
 @command(play, "episodes")
@@ -59,7 +60,7 @@ def episodes(
 
     seen = look_at(at.work, arm, seed)
     chosen = seen.choose(failed, where)
-    path = out or at.work.folder / "figures" / f"episodes-{arm}.png"
+    path = at.picture(out, f"episodes-{arm}.png")
     typer.echo(seen.failures().to_string())
     if not len(chosen):
         typer.echo("no episode is like that")
