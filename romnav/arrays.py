@@ -1,4 +1,4 @@
-"""Arrays and facts in one file, in the format of safetensors: mapped, not read, and nothing in it is ever run."""
+"""Arrays and facts in a file of a cache, in the format of safetensors: mapped, not read; nothing in it is ever run."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from romnav import files
+from romnav.errors import RomnavError
 
 NAMES = {
     "BOOL": np.dtype(np.bool_),
@@ -45,10 +46,15 @@ def save(path: Path, arrays: Mapping[str, NDArray], facts: Any) -> None:
     metadata["crc32"] = _checksum(header, parts)
     text = json.dumps(header).encode()
     text += b" " * (-(8 + len(text)) % ALIGNMENT)
-    with files.atomic(path) as file:
-        file.write(len(text).to_bytes(8, "little") + text)
-        for part in parts:
-            file.write(part)
+    try:
+        with files.atomic(path) as file:
+            file.write(len(text).to_bytes(8, "little") + text)
+            for part in parts:
+                file.write(part)
+    except RomnavError as error:
+        raise RomnavError(
+            f"{error}. {path.parent} is a cache: empty it, or make it a link to a folder elsewhere"
+        ) from error
 
 
 def load(path: Path) -> tuple[dict[str, NDArray], Any] | None:

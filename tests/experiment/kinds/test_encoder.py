@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import matplotlib.image
@@ -14,6 +16,7 @@ from romnav.experiment.graph.run import execute, pending
 from romnav.experiment.graph.stage import Session
 from romnav.experiment.kinds.encoder import encoder, quality
 from romnav.sensing.encoder import load
+from romnav.world.build import build
 from tests.experiment.conftest import workspace
 
 SCALE = """
@@ -54,6 +57,34 @@ def test_encoders_are_trained_and_judged(tmp_path: Path) -> None:
         record = records.read(encoder(here, sensor))
         assert record is not None
         assert record.facts == {"digest": trained.digest()}
+
+
+def test_a_full_disk_under_the_cache_is_not_blamed_on_the_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = workspace(tmp_path, SCALE)
+    cache, sync = here.project.worlds, os.fsync
+
+    def full(file: int) -> None:
+        if Path(os.readlink(f"/proc/self/fd/{file}")).is_relative_to(cache):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(file)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(RomnavError) as caught:
+        execute([encoder(here, "lidar")], Session())
+    file, reason = str(caught.value).split(": cannot be written ")
+    assert Path(file).parent == cache
+    assert reason == (
+        f"(no space left on device); free some disk space. {cache} is a cache: empty it, or make it a link to a folder "
+        "elsewhere"
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    cache.rmdir()
+    cache.symlink_to(elsewhere)
+    build(here.settings.world, cache)
+    assert [path.suffix for path in elsewhere.iterdir()] == [".safetensors"]
 
 
 def test_an_encoder_is_not_judged_on_its_training_terrain(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
 from romnav.robot.spec import LocomotionSpec, PpoSpec, RewardSpec, TaskSpec, TileTaskSpec
 from romnav.robot.statics import Geoms
+from romnav.stopping import Stopped
 from romnav.world.build import build
 from romnav.world.spec import WorldSpec
 from tests.test_journal import told
@@ -153,6 +155,29 @@ def test_a_killed_run_resumes_to_the_bit(tmp_path: Path) -> None:
         load_policy(tmp_path / "broken.pt")
     with pytest.raises(RomnavError, match="no such locomotion policy"):
         load_policy(tmp_path / "none.pt")
+
+
+def test_a_signal_in_an_iteration_saves_first_and_the_run_goes_on_to_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = LocomotionEnv.step
+
+    def terminated(env: LocomotionEnv, actions: torch.Tensor) -> object:
+        signal.raise_signal(signal.SIGTERM)
+        return step(env, actions)
+
+    whole = train(SPEC, tmp_path / "whole", threads=1)
+    monkeypatch.setattr(LocomotionEnv, "step", terminated)
+    with pytest.raises(Stopped) as caught:
+        train(SPEC, tmp_path / "parts", threads=1, save_every=3600.0)
+    assert caught.value.number == signal.SIGTERM
+    assert KIND.load(tmp_path / "parts" / "policy.pt")["iteration"] == 1
+    monkeypatch.undo()
+    parts = train(SPEC, tmp_path / "parts", threads=1)
+    a, b = (KIND.load(path) for path in (whole, parts))
+    for part in ("actor_state_dict", "critic_state_dict"):
+        torch.testing.assert_close(a["ppo"][part], b["ppo"][part], rtol=0, atol=0)
+    torch.testing.assert_close(a["average"], b["average"], rtol=0, atol=0)
 
 
 def test_rows_behind_the_checkpoint_are_not_there_twice(tmp_path: Path) -> None:
