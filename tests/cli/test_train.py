@@ -5,12 +5,16 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
+import torch
 
+from romnav.navigation import checkpoint
 from tests.cli.conftest import ROOT, edit, fails, romnav
 
 
@@ -20,27 +24,64 @@ def test_several_processes_train_policies_alone(project: Path, monkeypatch: pyte
     assert "start them by torchrun" in fails("train", "policy", "rom")
 
 
+WITNESS = """
+import os
+import torch
+from romnav.cli import app
+from romnav.navigation import train
+
+def make(*words):
+    made.append(make_ppo(*words))
+    return made[-1]
+
+made, make_ppo, train.make_ppo = [], train.make_ppo, make
+try:
+    app()
+finally:
+    torch.save({"actor": made[0].actor.state_dict(), "critic": made[0].critic.state_dict()}, os.environ["RANK"])
+"""
+"""The command line, of which every process writes what it has learned into a file called by its rank."""
+
+
 @pytest.mark.slow
-def test_torchrun_makes_what_is_upstream_once_and_one_record(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torchrun_trains_what_one_process_would_and_makes_one_record(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Actions are drawn by each process, so the weights are not those of one; starts and ends of episodes are."""
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     (project / "experiments" / "scales" / "tiny.toml").write_text(importlib.import_module("_kills").TINY)
+    (project / "witness.py").write_text(WITNESS)
 
-    def torchrun(processes: int) -> subprocess.CompletedProcess[str]:
+    def torchrun(processes: int, *program: str) -> subprocess.CompletedProcess[str]:
         launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
-        command = [*launcher, "-m", "romnav.cli", "train", "policy", "rom", "--scale", "tiny"]
+        command = [*launcher, *program, "train", "policy", "rom", "--scale", "tiny"]
         return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
 
-    refused = torchrun(3)
+    refused = torchrun(3, "-m", "romnav.cli")
     assert refused.returncode == 1
     assert "error: navigation.env.envs: 16 in 2 minibatches (ppo.minibatches) cannot be shared by 3" in refused.stderr
-    done = torchrun(2)
+    done = torchrun(2, "witness.py")
     assert done.returncode == 0, done.stderr
     assert "encoder lidar" not in done.stderr
-    record = json.loads((project / "results" / "tiny" / "rom" / "seed-0" / "spec.json").read_text())
+    made = project / "results" / "tiny"
+    record = json.loads((made / "rom" / "seed-0" / "spec.json").read_text())
     assert record["facts"]["processes"] == 2
-    assert record["facts"]["steps"] == 5120
-    assert torchrun(2).stderr.count("nothing to do") == 1
+    assert torchrun(2, "-m", "romnav.cli").stderr.count("nothing to do") == 1
     assert "nothing to do" in romnav("train", "policy", "rom", "--scale", "tiny").stderr
+
+    policy, second = checkpoint.read(made / "rom" / "seed-0" / "policy.pt"), torch.load("1")
+    for owner in ("actor", "critic"):
+        assert policy[owner].keys() == second[owner].keys()
+        for name, value in policy[owner].items():
+            assert value.isfinite().all()
+            assert torch.equal(value, second[owner][name]), name
+
+    shutil.copytree(made / "encoder", project / "alone" / "tiny" / "encoder")
+    assert romnav("train", "policy", "rom", "--scale", "tiny", "--results", "alone").exit_code == 0
+    both, alone = (pd.read_csv(results / "rom" / "seed-0" / "curve.csv") for results in (made, Path("alone", "tiny")))
+    assert record["facts"]["steps"] == alone.steps.iloc[-1] == 5120
+    pd.testing.assert_frame_equal(both[["iteration", "steps", "episodes"]], alone[["iteration", "steps", "episodes"]])
+    assert both.reward_height[0] == pytest.approx(alone.reward_height[0], rel=1e-3)
 
 
 @pytest.mark.slow
