@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import hashlib
+import io
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from romnav.errors import RomnavError
 
@@ -68,6 +70,20 @@ def write(path: Path, data: bytes | str) -> None:
     """Writes a file with ``atomic``; text in UTF-8."""
     with atomic(path) as file:
         file.write(data.encode() if isinstance(data, str) else data)
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
+    """Rows as the text of a CSV file, floats to six digits.
+
+    Without ``columns``, they are those of all rows; where one comes up along the rows, it is 0 above.
+    """
+    text = io.StringIO()
+    found = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, columns or tuple(found), restval=0, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: x if isinstance(x, (int, str)) else f"{x:.6g}" for name, x in row.items()})
+    return text.getvalue()
 
 
 def digest(path: Path) -> str:

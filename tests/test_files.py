@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from romnav import files
@@ -32,6 +33,12 @@ def test_bytes_and_text_are_written(tmp_path: Path) -> None:
     files.write(tmp_path / "b", "ä")
     assert (tmp_path / "a").read_bytes() == b"\x00\xff"
     assert (tmp_path / "b").read_bytes() == "ä".encode()
+
+
+def test_rows_have_exact_counts_six_digits_and_zeros_before_a_column_comes_up() -> None:
+    rows = [{"arm": "a", "steps": 50331648, "loss": 1 / 3}, {"arm": "b", "steps": 2, "late": np.float32(1.0)}]
+    assert files.csv_text(rows) == "arm,steps,loss,late\na,50331648,0.333333,0\nb,2,0,1\n"
+    assert files.csv_text(rows[:1], ["loss", "arm", "steps"]) == "loss,arm,steps\n0.333333,a,50331648\n"
 
 
 def test_a_file_in_place_of_the_folder_is_one_clear_error(tmp_path: Path) -> None:

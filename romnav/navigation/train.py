@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import signal
 import time
@@ -164,7 +162,7 @@ def _train(
     policy = out / "policy.pt"
     if journal:
         journal.close()
-        _write_curve(out / "curve.csv", curve)
+        files.write(out / "curve.csv", files.csv_text(curve))
         _save_policy(policy, identity, ppo, total * steps, seconds)
     return policy
 
@@ -228,7 +226,7 @@ def _save(
         "curve": curve,
     }
     checkpoint.save(path, content)
-    _write_curve(path.with_name("curve.csv"), curve)
+    files.write(path.with_name("curve.csv"), files.csv_text(curve))
 
 
 def _unfreeze(ppo: BoundedPPO, env: NavigationEnv, perception: Perception) -> TensorDict:
@@ -301,13 +299,3 @@ def _summary(curve: list[dict[str, float]], window: int = 10) -> str:
         return sum(r[key] * r["episodes"] for r in rows) / weight if weight else 0.0
 
     return f"success {mean('success'):.0%} (same {mean('same'):.0%}, cross {mean('cross'):.0%})"
-
-
-def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:
-    if not curve:
-        return
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(curve[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: f"{v:.6g}" for k, v in row.items()} for row in curve)
-    files.write(path, text.getvalue())

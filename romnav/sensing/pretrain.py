@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import hashlib
-import io
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -306,11 +304,8 @@ class _Training:
         self.step, self._rows, self._recent = content["step"], content["rows"], content["recent"]
 
     def curve(self) -> str:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["step", "learning_rate", "loss", *TERMS])
-        writer.writerows([[int(step), *(f"{x:.6g}" for x in rest)] for step, *rest in self._rows])
-        return text.getvalue()
+        names = ("step", "learning_rate", "loss", *TERMS)
+        return files.csv_text([dict(zip(names, row, strict=True)) for row in self._rows])
 
 
 def _key(spec: PretrainSpec, sensor: Sensor, poses: Poses) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -37,12 +37,3 @@ def read(path: Path) -> list[dict[str, str]]:
         return []
     reader = csv.DictReader(io.StringIO(path.read_text("utf-8", errors="replace")))
     return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
-
-
-def text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Rows as a file."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-    return out.getvalue()

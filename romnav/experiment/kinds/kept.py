@@ -127,5 +127,5 @@ def _judge(
         place = {"policy": name, "episodes": episodes.digest, "iteration": int(file.stem)}
         place |= {"steps": saved["steps"], "hours": saved["hours"]}
         rows[name] = place | along.row({**walked, "where": where, "how": how})
-        files.write(stage.folder / "kept.csv", along.text(list(rows.values())))
+        files.write(stage.folder / "kept.csv", files.csv_text(list(rows.values()), along.COLUMNS))
     return {"policies": len(policies)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -285,7 +284,8 @@ def train(
             if stop or time.monotonic() - mark > save_every or iteration == spec.iterations:
                 mark = time.monotonic()
                 journal.flush()
-                _write_curve(out / "curve.csv", curve)  # first: a resumed run drops what is there too much
+                # first: a resumed run drops what is there too much
+                files.write(out / "curve.csv", files.csv_text(curve))
                 _save(path, spec, ppo, average, env, iteration, row["seconds"])
             stop.obey()
     journal.close()
@@ -339,15 +339,3 @@ def _read_curve(path: Path, iterations: int) -> list[dict[str, Any]]:
             return [row for row in csv.DictReader(file) if int(row["iteration"]) <= iterations]
     except (KeyError, TypeError, ValueError) as error:
         raise RomnavError(f"{path}: damaged; restore it, or delete it to begin a new one") from error
-
-
-def _write_curve(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Columns that come up along the run have zeros above."""
-    text = io.StringIO()
-    columns = dict.fromkeys(name for row in rows for name in row)
-    writer = csv.DictWriter(text, columns, restval=0, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(
-        {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in row.items()} for row in rows
-    )
-    files.write(path, text.getvalue())
