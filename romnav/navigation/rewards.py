@@ -92,11 +92,11 @@ def progress(best: Tensor, now: Tensor, full: float, share: float | None = None)
 
 def weights(spec: RewardSpec, done: float) -> dict[str, float]:
     """Weight of every term once the share ``done`` of the run is behind, the common factor included."""
-    before, after = spec.action_rate
-    table = spec.model_dump()
-    named = {name: table[name] for name in TERMS if name != "action_rate"}
-    named["action_rate"] = after if done >= spec.action_rate_switch else before
-    named |= spec.terms
+    late = done >= spec.action_rate_switch
+    table = spec.model_dump() | {"action_rate": spec.action_rate[late]}
+    if late and spec.collision_late is not None:
+        table["collision"] = spec.collision_late
+    named = {name: table[name] for name in TERMS} | spec.terms
     return {name: spec.scale * weight for name, weight in named.items()}
 
 

@@ -50,6 +50,12 @@ def test_action_rate_weight_switches_half_way(done: float, expected: float) -> N
     assert weights(RewardSpec(scale=1.0), done)["action_rate"] == expected
 
 
+@pytest.mark.parametrize(("late", "expected"), [(None, (-0.1, -0.1)), (-1.0, (-0.1, -1.0))])
+def test_collision_weight_switches_with_it_where_asked(late: float | None, expected: tuple[float, float]) -> None:
+    spec = RewardSpec(scale=1.0, collision=-0.1, collision_late=late)
+    assert tuple(weights(spec, done)["collision"] for done in (0.49, 0.5)) == expected
+
+
 @pytest.mark.parametrize("planar", [0.0, 0.1, 0.5, 1.9])
 def test_position(planar: float) -> None:
     expected = 1 + math.exp(-(planar**2) / 0.25) + math.exp(-(planar**2) / 0.01)
