@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -108,6 +109,8 @@ class Training:
     scale: str = TINY
     walks: bool = False
     """Whether it needs a humanoid that walks."""
+    makes: str = ""
+    """Files of that humanoid that it makes itself, as a pattern."""
 
 
 TRAININGS = {
@@ -118,28 +121,36 @@ TRAININGS = {
     "two arms side by side": Training(
         ("run", "ablation", "pair"), ("rom/seed-0/policy.pt", "uniform/seed-0/policy.pt")
     ),
+    "gait library": Training(("train", "gaits"), ("locomotion/gaits.pt",), scale="", walks=True, makes="gaits*"),
 }
 
 
 def kill(kind: str, trials: range, folder: Path) -> Counter[str]:
-    """Kills a training at a random time in each of numbered ``trials``, resumes it, and compares its weights."""
+    """Kills a training at a random time in each of numbered ``trials``, resumes it, and compares its weights.
+
+    It is killed alone or with all processes that it has started, as luck has it.
+    """
     training = TRAININGS[kind]
     project = _project(training, folder)
     begun = time.monotonic()
-    if _run(training, project, "whole", None):
+    if _run(training, project, "whole"):
         raise SystemExit(f"{kind}: fails without being killed: {_said(project, 'whole')}")
     length = time.monotonic() - begun
     whole = _weights(training, project, "whole")
     count: Counter[str] = Counter()
     for n in trials:
-        luck = np.random.default_rng([n, *kind.encode()])
-        _run(training, project, f"trial-{n}", float(luck.uniform(0.2, 1.0)) * length)
-        ended = _run(training, project, f"trial-{n}", None)
-        same = not ended and _weights(training, project, f"trial-{n}") == whole
+        luck, name = np.random.default_rng([n, *kind.encode()]), f"trial-{n}"
+        seconds, alone = float(luck.uniform(0.2, 1.0)) * length, bool(luck.random() < 0.5)
+        while not (ended := _run(training, project, name, seconds, alone)):
+            shutil.rmtree(project / name)  # it had ended before: nothing was tried
+            seconds *= 0.8
+        if ended == -signal.SIGKILL:
+            ended = _run(training, project, name)
+        same = not ended and _weights(training, project, name) == whole
         count["same bits" if same else "lost"] += 1
         if not same:
-            print(f"{kind} {n}: {'other weights' if not ended else _said(project, f'trial-{n}')}", flush=True)
-        shutil.rmtree(project / f"trial-{n}", ignore_errors=True)
+            print(f"{kind} {n}: {'other weights' if not ended else _said(project, name)}", flush=True)
+        shutil.rmtree(project / name, ignore_errors=True)
     return count
 
 
@@ -153,19 +164,25 @@ def _project(training: Training, folder: Path) -> Path:
     return folder
 
 
-def _run(training: Training, project: Path, results: str, kill_after: float | None) -> int:
-    """Runs it to its end, or until it is killed with SIGKILL; the exit status."""
+def _run(training: Training, project: Path, results: str, kill_after: float = PATIENCE, alone: bool = False) -> int:
+    """Runs it to its end, or until it is killed, ``alone`` or with what it has started; the exit status."""
     if training.walks:
-        shutil.copytree(ROOT / "results/cpu/locomotion", project / results / "tiny" / "locomotion", dirs_exist_ok=True)
+        walking, own = project / results / "tiny" / "locomotion", shutil.ignore_patterns(training.makes)
+        shutil.copytree(ROOT / "results/cpu/locomotion", walking, dirs_exist_ok=True, ignore=own)
     command = [sys.executable, "-c", OFTEN, *training.words, "--scale", "tiny", "--results", str(project / results)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     with (project / f"{results}.log").open("w") as log:
-        process = subprocess.Popen(command, cwd=project, env=environment, stdout=subprocess.DEVNULL, stderr=log)
+        process = subprocess.Popen(
+            command, cwd=project, env=environment, stdout=subprocess.DEVNULL, stderr=log, process_group=0
+        )
     try:
-        return process.wait(kill_after if kill_after is not None else PATIENCE)
+        return process.wait(kill_after)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGKILL)
+        (os.kill if alone else os.killpg)(process.pid, signal.SIGKILL)
         return process.wait()
+    except KeyboardInterrupt:  # which a group of its own does not hear
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
 
 
 def _said(project: Path, results: str) -> str:
@@ -173,15 +190,22 @@ def _said(project: Path, results: str) -> str:
 
 
 def _weights(training: Training, project: Path, results: str) -> list[str]:
-    """Digests of the weights; the files also hold how long it took."""
+    """Digests of the weights or gaits; the files also hold how long it took."""
     import torch
 
     found = []
     for name in training.ends_in:
         content = torch.load(project / results / "tiny" / name, weights_only=True)
-        tensors = content.get("actor") or content.get("weights") or content["ppo"]["actor_state_dict"]
         part = project / results / "weights"
-        torch.save({key: tensors[key].clone() for key in sorted(tensors)}, part)
+        torch.save(_made(content), part)
         found.append(digest(part))
         part.unlink()
     return found
+
+
+def _made(content: dict[str, Any]) -> Any:
+    """What of a file has to be the same."""
+    if "gaits" in content:
+        return content["gaits"]
+    tensors = content.get("actor") or content.get("weights") or content["ppo"]["actor_state_dict"]
+    return {key: tensors[key].clone() for key in sorted(tensors)}

@@ -32,8 +32,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="romnav-faults-") as place:
         for kind in _damage.FILES:
             _add(file, counts, "damages", kind, given.damages, Path(place) / "damage")
-        for kind in _kills.TRAININGS:
-            _add(file, counts, "kills", kind, given.kills // len(_kills.TRAININGS), Path(place) / kind)
+        for k, kind in enumerate(_kills.TRAININGS):  # those that are left when all have had as many go to the last
+            _add(file, counts, "kills", kind, (given.kills + k) // len(_kills.TRAININGS), Path(place) / kind)
         _add(file, counts, "warp", "eight processes and an empty cache", given.warp, Path(place) / "warp")
     _drive(file, counts, given.worlds)
     text = table(counts)

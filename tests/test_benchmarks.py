@@ -6,7 +6,9 @@ import importlib
 import json
 import math
 import os
+import signal
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from romnav.robot.gaits import Gait, GaitLibrary
 from romnav.sensing.lidar import Lidar
 from romnav.sensing.spec import LidarSpec
 from romnav.world.solids import SolidsBuilder
@@ -180,6 +183,117 @@ def test_the_guarantee_counts_collisions(common: ModuleType, monkeypatch: pytest
 
     monkeypatch.setattr(guarantee, "SafetyFilter", Careless)
     assert guarantee.batch(1, 1)[0] < 0.0
+
+
+@pytest.fixture
+def kills(common: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = importlib.import_module("_kills")
+    monkeypatch.setattr(module, "TRAININGS", {"one": module.Training(("train",), ("policy.pt",))})
+    return module
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_training_is_killed_alone_or_with_what_it_started(
+    kills: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alone: bool
+) -> None:
+    starts = "import subprocess, sys; child = subprocess.Popen(['sleep', '60']); "
+    monkeypatch.setattr(kills, "OFTEN", f"{starts} print(child.pid, file=sys.stderr, flush=True); child.wait()")
+    assert kills._run(kills.TRAININGS["one"], tmp_path, "x", 3.0, alone) == -signal.SIGKILL
+    child = int(kills._said(tmp_path, "x"))
+    try:
+        for _ in range(100):  # a process that was killed is there until its new parent has looked
+            state = Path(f"/proc/{child}/stat")
+            alive = state.exists() and state.read_text().split()[2] != "Z"
+            if alive == alone:
+                break
+            time.sleep(0.05)
+        assert alive == alone
+    finally:
+        if alive:
+            os.kill(child, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("ends", "weights", "counted"),
+    [
+        ([0, -signal.SIGKILL, 0], "whole", {"same bits": 1}),
+        ([0, 0, 0, -signal.SIGKILL, 0], "whole", {"same bits": 1}),
+        ([0, -signal.SIGKILL, 0], "other", {"lost": 1}),
+        ([0, -signal.SIGKILL, 1], "whole", {"lost": 1}),
+        ([0, 1], "whole", {"lost": 1}),
+    ],
+    ids=["resumed", "ended before it was killed", "other weights", "fails when resumed", "fails by itself"],
+)
+def test_what_counts_is_a_training_that_was_killed_and_ends_in_the_same_weights(
+    kills: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: list[int], weights: str, counted: Any
+) -> None:
+    given = iter(ends)
+    after: list[float] = []
+
+    def run(training: Any, project: Path, results: str, seconds: float = math.inf, alone: bool = False) -> int:
+        (project / results).mkdir(exist_ok=True)
+        (project / f"{results}.log").touch()
+        after.append(seconds)
+        return next(given)
+
+    monkeypatch.setattr(kills, "_run", run)
+    monkeypatch.setattr(
+        kills, "_weights", lambda training, project, results: ["whole" if results == "whole" else weights]
+    )
+    assert kills.kill("one", range(1), tmp_path / "one") == counted
+    assert next(given, None) is None
+    tries = [seconds for seconds in after if math.isfinite(seconds)]
+    assert tries == sorted(tries, reverse=True)
+    assert len(set(tries)) == len(tries)
+
+
+def test_a_gait_library_is_the_same_where_every_frame_is(kills: ModuleType, tmp_path: Path) -> None:
+    training = kills.Training(("train", "gaits"), ("gaits.pt",))
+
+    def digests(name: str, slope: float, height: float) -> list[str]:
+        frames = {"base": torch.tensor([0.7, height])}
+        GaitLibrary([Gait("stair", 1, slope, frames)]).save(tmp_path / name / "tiny" / "gaits.pt")
+        found: list[str] = kills._weights(training, tmp_path, name)
+        return found
+
+    whole = digests("whole", 0.5, 0.8)
+    assert digests("again", 0.5, 0.8) == whole
+    assert digests("higher", 0.5, 0.9) != whole
+    assert digests("steeper", 0.6, 0.8) != whole
+
+
+def test_the_humanoid_of_a_training_comes_without_what_it_makes(
+    kills: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kills, "OFTEN", "")
+    walking = tmp_path / "results/cpu/locomotion"
+    walking.mkdir(parents=True)
+    for name in ("policy.pt", "gaits.pt", "gaits-record.json"):
+        (walking / name).touch()
+    monkeypatch.setattr(kills, "ROOT", tmp_path)
+    for makes, left in (("", 3), ("gaits*", 1)):
+        training = kills.Training(("train", "gaits"), (), walks=True, makes=makes)
+        assert kills._run(training, tmp_path, f"without {makes}") == 0
+        assert len([*(tmp_path / f"without {makes}" / "tiny" / "locomotion").iterdir()]) == left
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_kills_are_shared_among_all_trainings(
+    common: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    faults = importlib.import_module("faults")
+    tried: dict[str, int] = {}
+
+    def kill(kind: str, trials: range, folder: Path) -> Counter[str]:
+        tried[kind] = len(trials)
+        return Counter(lost=len(trials))
+
+    monkeypatch.setattr(faults._kills, "kill", kill)
+    none = ["--warp", "0", "--worlds", "0", "--damages", "0"]
+    monkeypatch.setattr("sys.argv", ["faults.py", *none, "--kills", str(count), "--out", str(tmp_path)])
+    faults.main()
+    assert sum(tried.values()) == count
+    assert len(tried) == min(count, len(faults._kills.TRAININGS))
 
 
 def test_faults_are_counted_over_several_calls(
