@@ -125,7 +125,8 @@ def test_a_killed_ablation_leaves_no_training_and_a_restart_waits_for_what_still
         for child in children:
             with suppress(ProcessLookupError):
                 os.kill(child, signal.SIGKILL)
-    assert again.wait() == 128 + signal.SIGTERM
+        status = again.wait()
+    assert status == 128 + signal.SIGTERM
     assert not holders()
     for folder, written in begun.items():
         assert (folder / "kept" / "000001.pt").stat().st_mtime_ns == written  # gone on from there
