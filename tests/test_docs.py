@@ -37,11 +37,11 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def commands() -> Iterator[tuple[str, str]]:
-    for page in DOCS:
+    for page in PAGES:
         for block in re.findall(r"```\n(.*?)```", page.read_text(), flags=re.DOTALL):
-            for line in block.splitlines():
-                if found := re.match(r"(?:\w+=\S+ )*romnav (.*)", line):
-                    yield named(page), found[1].partition("#")[0]
+            for line in block.replace("\\\n", "").splitlines():
+                if found := re.search(r"^(?:\$ )?(?:\w+=\S+ )*romnav (.*)|\btorchrun .* -m romnav\.cli ([^']*)", line):
+                    yield named(page), (found[1] or found[2]).partition("#")[0]
 
 
 @pytest.mark.parametrize(("page", "line"), list(commands()))
@@ -51,6 +51,25 @@ def test_commands_are_there_and_take_their_options(page: str, line: str) -> None
     while hasattr(command, "commands"):
         name, command, rest = command.resolve_command(context, [*context._protected_args, *context.args])
         context = command.make_context(name, rest, parent=context)
+
+
+def test_the_loop_for_slurm_submits_every_line_after_those_that_it_needs(tmp_path: Path) -> None:
+    (loop,) = re.findall(r"```\n(declare .*?)```", (ROOT / "docs/scale.md").read_text(), flags=re.DOTALL)
+    lines = ["romnav train policy rom # 1", "romnav eval rom # 2 after 1", "romnav run ablation pair # 3 after 1,2"]
+    stand_ins = {
+        "romnav": "printf '%s\\n' " + shlex.join(lines),
+        "sbatch": 'echo "$@" >> jobs; expr 70 + $(wc -l < jobs)',
+    }
+    for name, text in stand_ins.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    subprocess.run(["bash", "-euc", loop], cwd=tmp_path, env={"PATH": f"{tmp_path}:{os.environ['PATH']}"}, check=True)
+    jobs = [line.partition("yes ")[2] for line in (tmp_path / "jobs").read_text().splitlines()]
+    assert jobs == [
+        "--wrap romnav train policy rom",
+        "--dependency=afterok:71 --wrap romnav eval rom",
+        "--dependency=afterok:71:72 --wrap romnav run ablation pair",
+    ]
 
 
 def test_the_tutorials_experiment_is_one(tmp_path: Path) -> None:
