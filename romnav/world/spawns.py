@@ -53,8 +53,9 @@ def sample(world: World, spec: SamplerSpec, seed: int, tile: Tensor, env: Tensor
     spawn = start + ((end - start) * u(_SPAWN)).long()
     low, high = world.spawn_start[tile], world.spawn_start[tile + 1]
     on_stair = (u(_SPAWN_KIND) < spec.stair_probability) & (high > low)
-    picked = (low + ((high - low) * u(_SPAWN)).long()).clamp_(max=len(world.spawn) - 1)
-    spawn = torch.where(on_stair, world.spawn[picked], spawn)
+    candidates = torch.cat([world.spawn, start[:1]])  # one beyond, where the last tiles, or all, have no stair
+    picked = low + ((high - low) * u(_SPAWN)).long()
+    spawn = torch.where(on_stair, candidates[picked], spawn)
     goal = _draw_goal(world, spec, tile, spawn, u(_CROSS), u(_GOAL))
     inside = torch.stack([u(_OFFSET_X), u(_OFFSET_Y)], dim=1) - 0.5
     return Start(

@@ -97,6 +97,12 @@ def test_stair_spawns_are_on_or_at_the_mouth_of_a_connector(world: World) -> Non
             assert min(np.hypot(*(p - m)[:2]) for m in mouths) < MOUTH_RADIUS
 
 
+def test_a_world_without_stairs_spawns_anywhere() -> None:
+    world = build(WorldSpec(tiles=1, classes=("room",), goals_per_tile=4))
+    assert len(world.spawn) == 0
+    assert (facts(world, draw(world, SamplerSpec(stair_probability=1.0)))[0] >= 0).all()
+
+
 def test_a_draw_depends_on_seed_environment_and_episode_alone(world: World) -> None:
     whole = draw(world, SamplerSpec())
     some = torch.tensor([5, 999, 17])
