@@ -11,7 +11,10 @@ import pytest
 
 from romnav.errors import RomnavError
 from romnav.experiment import template
+from romnav.experiment.graph.run import pending
+from romnav.experiment.kinds.encoder import encoder
 from romnav.experiment.project import Project
+from romnav.experiment.workspace import Workspace
 from tests.cli.conftest import fails, romnav
 
 ROOT = Path(__file__).parents[1]
@@ -67,6 +70,8 @@ def test_a_new_project_has_all_that_a_first_run_needs(tmp_path: Path, monkeypatc
     assert {path.name for path in (folder / "experiments" / "episodes").iterdir()} >= {"dev.json", "paired-2.json"}
     monkeypatch.chdir(folder)
     assert "rom" in romnav("results").stdout
+    assert not pending([encoder(Workspace(made, "smoke"), "lidar")])
+    assert romnav("run", "ablation", "spawn-goal", "--print").stdout.count("\n") == 1, "only tables are to be drawn"
     assert not [*folder.rglob("checkpoint.pt")]
     assert fails("init", str(folder)).endswith("experiments: exists; name another folder")
     assert "change to a copy of the romnav repository" in fails("bench")

@@ -1,4 +1,4 @@
-"""What a new project begins with: experiments, scales, episode sets, and the small policies of the smoke scale."""
+"""What a new project begins with: experiments, scales, episode sets, and what there is at the smoke scale."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from romnav.files import unwritable
 CARRIED = (
     "experiments/**/*",
     "results/smoke/bands.json",
-    "results/smoke/encoder/*/encoder.*",
-    *(f"results/smoke/*/seed-*/{name}" for name in ("policy.pt", "spec.json", "curve.csv", "episodes.*")),
+    *(f"results/smoke/encoder/*/{name}" for name in ("encoder.*", "curve.csv")),
+    *(f"results/smoke/*/seed-*/{name}" for name in ("policy.pt", "spec.json", "curve.csv", "episodes.*", "tracks.npz")),
 )
 """Files of a new project; a wheel has them in ``romnav/template`` (pyproject.toml), a checkout where they are made."""
 IGNORED = ".cache/\nresults/**/checkpoint.pt\nresults/**/kept/\n"

@@ -63,13 +63,13 @@ class RewardSpec(Config):
     collision: NonPositive = -1.0
     """Weight per body in contact (P)."""
     collision_late: NonPositive | None = Field(default=None, exclude_if=lambda weight: weight is None)
-    """The same from where the action rate's weight switches (A: as before; a policy that has to be free to explore first
-    can be made careful then)."""
+    """The same from where the action rate's weight switches (A: as before; a policy that has to be free to explore
+    first can be made careful then)."""
     action_rate: tuple[NonPositive, NonPositive] = (-0.01, -0.1)
     """Weight of the squared change of the command before and after the switch (P)."""
     action_rate_switch: Share = 0.5
-    """Share of the run after which the action-rate weight switches (P: iteration 1000 of 2000), and the collision's if it
-    does."""
+    """Share of the run after which the action-rate weight switches (P: iteration 1000 of 2000), and the collision's if
+    it does."""
     gate: NonNegative = 2.0
     """Geodesic distance below which the gated terms pay, m (P)."""
     progress_speed: Positive = 0.75
