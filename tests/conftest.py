@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -10,6 +11,14 @@ import pytest
 from romnav.evaluation.paired import rows
 from romnav.evaluation.trials import rows as trial_rows
 from romnav.world.spec import SMALLEST
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _hang_ups_are_heard() -> Iterator[None]:
+    """Whoever starts the tests under nohup has them ignore the signal that some of them send."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def _episode_rows(
