@@ -18,6 +18,7 @@ __all__ = ["over_threads", "wp"]
 ROOM = 16_000_000
 """Bytes for kernels that are yet to be compiled; all of them need a third."""
 
+
 def _start() -> None:
     """Start Warp.
 
