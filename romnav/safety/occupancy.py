@@ -8,7 +8,8 @@ an obstacle if it lies more than a step above the ground of its cell and lower t
 
 What has left the field of view is remembered if the caller tells how the robot has moved: one return of each cell,
 carried along at its own place rather than its cell's, so that nothing is rounded twice. It is forgotten after a while;
-where it is so near to the robot that the sensor cannot see it again, not by time but by the way that the robot goes.
+where it is so near to the robot that the sensor cannot see it again, not by time but by the way that the robot goes,
+of which trembling is no part.
 """
 
 from __future__ import annotations
@@ -149,12 +150,12 @@ def _remember(p: wp.vec3, age: wp.int64, half: float, cell: float, b: int, memor
 def _recall(
     before: wp.array3d(dtype=wp.int64),
     motion: wp.array(dtype=wp.vec4),
+    way: wp.array(dtype=float),
     half: float,
     cell: float,
     step: float,
     calls: float,
     blind: float,
-    still: float,
     travel: float,
     memory: wp.array3d(dtype=wp.int64),
 ):
@@ -171,9 +172,7 @@ def _recall(
     x = _unpack(packed, 16, 2.0 * half, _SHARE) - half - moved[0]
     y = _unpack(packed, 0, 2.0 * half, _SHARE) - half - moved[1]
     z = _TOP - _unpack(packed, 32, _HEIGHTS, _DEPTH) - moved[2]
-    way = wp.length(wp.vec2(moved[0], moved[1]))
-    nearby = wp.where(way > still, calls * way / travel, 0.0)
-    age += wp.where(wp.length(wp.vec2(x, y)) <= blind, nearby, 1.0)
+    age += wp.where(wp.length(wp.vec2(x, y)) <= blind, calls * way[b] / travel, 1.0)
     if age >= calls or z <= step:
         return
     c = wp.cos(moved[3])
@@ -313,14 +312,29 @@ class Rasterizer:
         self._gap = torch.empty_like(self._lowest)
         self._queue = wp.empty((robots, coarse * coarse), dtype=int, device=device)
         self._memory = torch.full((robots, *self.shape), _NOTHING, dtype=torch.int64, device=device)
+        # from where its way was last counted to each robot, in its frame, m
+        self._away = torch.zeros(robots, 2, device=device)
 
     def reset(self, robots: torch.Tensor | None = None) -> None:
         """Forget what ``robots`` have seen (a mask or indices; all of them by default)."""
-        self._memory[slice(None) if robots is None else robots] = _NOTHING
+        which = slice(None) if robots is None else robots
+        self._memory[which] = _NOTHING
+        self._away[which] = 0.0
 
     def carry(self, others: Sequence[Rasterizer], robots: torch.Tensor) -> None:
         """Remember what ``robots`` (indices) among those of ``others``, counted through, have seen."""
         self._memory = torch.cat([other._memory for other in others])[robots]
+        self._away = torch.cat([other._away for other in others])[robots]
+
+    def _walk(self, motion: torch.Tensor) -> torch.Tensor:
+        """Ways (B,), m, that count now, and are therefore not counted again."""
+        away = self._away + motion[:, :2].nan_to_num(0.0, 0.0, 0.0)
+        far = away.norm(dim=1)
+        counts = far >= self.spec.still
+        c, s = torch.cos(motion[:, 3]).nan_to_num(1.0), torch.sin(motion[:, 3]).nan_to_num(0.0)
+        turned = torch.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], dim=1)
+        self._away = torch.where(counts[:, None], 0.0, turned)
+        return torch.where(counts, far, 0.0)
 
     def __call__(
         self, points: torch.Tensor, valid: torch.Tensor | None = None, motion: torch.Tensor | None = None
@@ -368,18 +382,19 @@ class Rasterizer:
             device=device,
         )
         if motion is not None:
+            motion = motion.float().contiguous()
             wp.launch(
                 _recall,
                 dim=before.shape,
                 inputs=[
                     wp.from_torch(before),
-                    wp.from_torch(motion.float().contiguous(), dtype=wp.vec4),
+                    wp.from_torch(motion, dtype=wp.vec4),
+                    wp.from_torch(self._walk(motion)),
                     half,
                     spec.cell,
                     spec.step,
                     float(spec.memory),
                     spec.blind,
-                    spec.still,
                     spec.travel,
                 ],
                 outputs=[memory],

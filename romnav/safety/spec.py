@@ -39,8 +39,9 @@ class OccupancySpec(Config):
     blind: NonNegative = 0.7
     """Distance within which a remembered return ages by the robot's way in place of time, m (A: the mounted LiDAR loses
     what is 0.3 m high at 0.68 m; a robot held in front of a bench would walk into it once it were forgotten)."""
-    still: NonNegative = 0.03
-    """Motion in a call that counts as none, m (A: 0.15 m/s; a robot that presses against the boundary trembles)."""
+    still: NonNegative = 0.2
+    """Way counts once a robot is so far from where it was last counted, m (A: pressed against the boundary it trembles
+    by a decimetre, 12 m in two minutes without leaving)."""
     travel: Positive = 3.0
     """Way after which what is near is forgotten, m (A: some 4 s of walking; not more, since what was a ledge from below
     is in the way of a robot that has climbed the stair)."""
