@@ -14,11 +14,13 @@ from romnav.world.spec import SMALLEST
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _hang_ups_are_heard() -> Iterator[None]:
-    """Whoever starts the tests under nohup has them ignore the signal that some of them send."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+def _signals_are_heard() -> Iterator[None]:
+    """Under nohup, or in the background of a script, tests would ignore signals that some of them send."""
+    heard = {signal.SIGHUP: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
+    before = {number: signal.signal(number, handler) for number, handler in heard.items()}
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def _episode_rows(
