@@ -84,16 +84,17 @@ def _of_csv(path: Path, row: str, column: str) -> float:
 
 
 def _kept(scale: str) -> str:
-    lines = ["| arm | steps | " + " | ".join(KEPT.values()) + " | SPL |", "|---" * (len(KEPT) + 3) + "|"]
+    lines = ["| arm | seed | steps | " + " | ".join(KEPT.values()) + " | SPL |", "|---" * (len(KEPT) + 4) + "|"]
     rows = []
     for path in (ROOT / "results" / scale).glob("*/seed-*/kept.csv"):
         with path.open(encoding="utf-8") as file:
-            rows += [(int(row["steps"]), path.parts[-3], row) for row in csv.DictReader(file)]
+            run = path.parts[-3], int(path.parts[-2].removeprefix("seed-"))
+            rows += [(int(row["steps"]), *run, row) for row in csv.DictReader(file)]
     if not rows:
         raise KeyError(f"no kept policies at {scale}")
-    for steps, arm, row in sorted(rows, key=lambda found: found[:2]):
+    for steps, arm, seed, row in sorted(rows, key=lambda found: found[:3]):
         rates = " | ".join(f"{float(row[key]):.1f}" for key in KEPT)
-        lines.append(f"| {arm} | {steps / 1e6:.1f} M | {rates} | {float(row['spl']):.3f} |")
+        lines.append(f"| {arm} | {seed} | {steps / 1e6:.1f} M | {rates} | {float(row['spl']):.3f} |")
     return "\n".join(lines)
 
 
