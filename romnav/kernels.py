@@ -16,7 +16,7 @@ from romnav.errors import RomnavError
 __all__ = ["over_threads", "wp"]
 
 ROOM = 16_000_000
-"""Bytes for kernels that are yet to be compiled; all of them need a third."""
+"""Bytes for kernels that are yet to be compiled; all thirty modules take 2.4 MB."""
 
 
 def _start() -> None:
