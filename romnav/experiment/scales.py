@@ -52,6 +52,8 @@ class Scale(Config):
     """Task, policy and reinforcement learning."""
     kickstart: KickstartSpec | None = None
     """Teacher of the policy, and how it teaches; without one, PPO alone."""
+    begin: str | None = Field(default=None, exclude_if=lambda arm: arm is None)
+    """Arm whose policy and critic the run begins with, so that it trains them on; random ones without (P)."""
     locomotion: LocomotionSpec = LocomotionSpec()
     """The humanoid, and the policy that walks it."""
     evaluation: EvaluationSpec = EvaluationSpec()
@@ -68,6 +70,11 @@ class Scale(Config):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
+        if self.begin and self.kickstart and self.kickstart.init == "teacher":
+            raise ValueError(
+                f"begin: the run cannot begin with {self.begin} and with its teacher (kickstart.init); "
+                'leave begin out, or set kickstart.init to "fresh"'
+            )
         env, cell = self.navigation.env, self.world.grid.cell
         if (way := env.command.forward * env.period) > 2 * cell:
             raise ValueError(

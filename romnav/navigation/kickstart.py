@@ -6,7 +6,6 @@ episodes, and never acts.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from romnav import ranks
 from romnav.errors import RomnavError
+from romnav.files import digest
 from romnav.navigation import checkpoint
 from romnav.navigation.observations import ACTIONS
 from romnav.navigation.perception import Perception
@@ -82,8 +82,7 @@ class Teacher:
             raise RomnavError(f"{path}: a teacher that trained its encoder; kickstart from one with a frozen encoder")
         self.actor.requires_grad_(False)
         self.spec = spec
-        with path.open("rb") as file:
-            self.digest = hashlib.file_digest(file, "sha256").hexdigest()
+        self.digest = digest(path)
 
     def __call__(self, obs: TensorDict) -> Tensor:
         """(E, 2, `ACTIONS`) float32 Beta parameters, one step on in its memory."""

@@ -42,6 +42,7 @@ def train(
     *,
     body: Body = ReducedOrderModel,
     kickstart: tuple[KickstartSpec, Path] | None = None,
+    begin: Path | None = None,
     device: str = "cpu",
     resume: bool = True,
     progress: Progress | None = None,
@@ -65,16 +66,17 @@ def train(
         seed: Of weights and episodes.
         body: Makes the robots.
         kickstart: How to be taught, and the teacher's policy.
+        begin: Policy that is trained on, and its critic; random ones without. The optimiser begins anew.
         device: Torch device.
         resume: Whether to go on from an earlier run.
         progress: Told (steps done, steps in all, recent success).
 
     Raises:
-        RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written; the teacher does not
-            fit; the environments cannot be shared by the processes.
+        RomnavError: The checkpoint to resume is torn or of another run; ``out`` cannot be written; the teacher, or the
+            policy to begin with, does not fit; the environments cannot be shared by the processes.
     """
     with torch_threads(spec.ppo.threads):
-        return _train(spec, world, perception, out, seed, body, kickstart, device, resume, progress)
+        return _train(spec, world, perception, out, seed, body, kickstart, begin, device, resume, progress)
 
 
 def _train(
@@ -85,6 +87,7 @@ def _train(
     seed: int,
     body: Body,
     kickstart: tuple[KickstartSpec, Path] | None,
+    begin: Path | None,
     device: str,
     resume: bool,
     progress: Progress | None,
@@ -97,6 +100,8 @@ def _train(
     env = NavigationEnv(world, dynamics, perception, spec.env, seed, device, numbers)
     obs = env.get_observations()
     ppo = _learner(spec, env, obs, perception, kickstart, device)
+    if begin is not None:
+        _begin(begin, perception, ppo)
     if ranks.size() > 1:
         ppo.broadcast_parameters()
     identity = {"spec": spec.model_dump_json(), "seed": seed, "encoder": perception.encoder.digest()}
@@ -104,6 +109,8 @@ def _train(
         identity["depth_encoder"] = perception.depth.encoder.digest()
     if kickstart is not None and isinstance(ppo, KickstartedPPO):
         identity |= {"kickstart": kickstart[0].model_dump_json(), "teacher": ppo.teacher.digest}
+    if begin is not None:
+        identity["begin"] = files.digest(begin)
     total = spec.ppo.iterations * spec.ppo.stages
     unfreeze_at = round(spec.encoder.unfreeze_at * total)
     state = out / "checkpoint.pt"
@@ -194,6 +201,21 @@ def _learner(
     ppo = make_ppo(blank_lesson(obs), spec.policy, spec.ppo, env.num_envs, device, KickstartedPPO)
     ppo.enrol(teacher, env.places)
     return ppo
+
+
+def _begin(path: Path, perception: Perception, ppo: BoundedPPO) -> None:
+    """Give actor and critic the weights that the policy of ``path`` and its critic have."""
+    depth = perception.depth.encoder if perception.depth else None
+    with torch.random.fork_rng():  # the weights that a network is made with are drawn, and the run's draws go on
+        given = checkpoint.load_actor(path, perception.encoder, depth_encoder=depth), checkpoint.load_critic(path)
+    for own, other in zip((ppo.actor, ppo.critic), given, strict=True):
+        weights = other.state_dict() if other else {}
+        if {n: w.shape for n, w in weights.items()} != {n: w.shape for n, w in own.state_dict().items()}:
+            raise RomnavError(
+                f"{path}: a run that begins with it needs the same networks and senses; give both arms the same "
+                "navigation.dynamics, navigation.policy and navigation.encoder, and both guidance or none"
+            )
+        own.load_state_dict(weights)
 
 
 def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:

@@ -107,6 +107,55 @@ def test_killed_and_resumed_equals_left_alone(
     assert len(curves[0]) == spec.ppo.iterations
 
 
+def test_a_run_that_begins_with_a_policy_trains_it_on(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path
+) -> None:
+    first = train.train(spec, world, perception, tmp_path / "first", 1)
+    slow = spec.model_copy(
+        update={"ppo": spec.ppo.model_copy(update={"learning_rate": 1e-9, "learning_rate_range": (1e-9, 1e-9)})}
+    )
+    on = train.train(slow, world, perception, tmp_path / "on", 2, begin=first)
+    anew = train.train(slow, world, perception, tmp_path / "anew", 2)
+    for network, name in (("actor", "attention.place"), ("critic", "mlp.0.weight")):
+        given, after, other = (checkpoint.read(path)[network][name] for path in (first, on, anew))
+        torch.testing.assert_close(after, given, atol=1e-6, rtol=0)
+        assert not torch.allclose(after, other, atol=1e-3)
+    # what is drawn in the run is not what it begins with
+    spawned = [next(csv.DictReader((path.with_name("curve.csv")).open())) for path in (on, anew)]
+    assert spawned[0]["episodes"] == spawned[1]["episodes"]
+
+
+def test_a_run_that_begins_with_a_policy_resumes_exactly(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path
+) -> None:
+    first = train.train(spec, world, perception, tmp_path / "first", 1)
+
+    def stop(done: int, total: int, metric: str) -> None:
+        if done == total // 2:
+            signal.raise_signal(signal.SIGTERM)
+
+    train.train(spec, world, perception, tmp_path / "whole", 2, begin=first)
+    with pytest.raises(Stopped):
+        train.train(spec, world, perception, tmp_path / "half", 2, begin=first, progress=stop)
+    with pytest.raises(RomnavError, match="another begin"):
+        train.train(spec, world, perception, tmp_path / "half", 2, begin=tmp_path / "whole" / "policy.pt")
+    train.train(spec, world, perception, tmp_path / "half", 2, begin=first)
+    assert_same(weights(tmp_path / "whole"), weights(tmp_path / "half"))
+
+
+def test_a_policy_to_begin_with_has_to_fit(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path
+) -> None:
+    first = train.train(spec, world, perception, tmp_path / "first", 1)
+    wider = spec.model_copy(update={"policy": spec.policy.model_copy(update={"critic": (8, 8)})})
+    guided = spec.model_copy(update={"ppo": spec.ppo.model_copy(update={"guidance": 0.5})})
+    for other in (wider, guided):
+        with pytest.raises(RomnavError, match="needs the same networks and senses"):
+            train.train(other, world, perception, tmp_path / "other", 1, begin=first)
+    with pytest.raises(RomnavError, match="no such policy"):
+        train.train(spec, world, perception, tmp_path / "other", 1, begin=tmp_path / "none.pt")
+
+
 def unfreezing(spec: NavigationSpec, share: float) -> NavigationSpec:
     return spec.model_copy(update={"encoder": EncoderUseSpec(unfreeze_at=share)})
 

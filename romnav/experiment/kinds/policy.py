@@ -27,10 +27,11 @@ DEPTH_NOISE = 1_000_003
 
 
 def policy(work: Workspace, arm: str, seed: int) -> Stage:
-    """The trained policy of an arm, or of the one whose policy it drives; a teacher is trained with the same seed.
+    """The trained policy of an arm, or of the one whose policy it drives; a teacher, and one that it begins with, are
+    trained with the same seed.
 
     Raises:
-        RomnavError: The teacher is no trained arm, or taught itself.
+        RomnavError: One of these is no trained arm, the teacher was taught itself, or the arm begins with itself.
     """
     arm = work.project.driver(arm)
     settings = work.arm_settings(arm)
@@ -44,6 +45,9 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
     teacher = [_teacher(work, arm, settings.kickstart.teacher, seed)] if settings.kickstart else []
     if teacher:
         uses.append("kickstart")
+    begun = [_begun(work, arm, settings.begin, seed)] if settings.begin else []
+    if begun:
+        uses.append("begin")
     return Stage(
         kind="policy",
         name=f"policy {arm}, seed {seed}",
@@ -53,7 +57,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         settings=settings,
         uses=tuple(uses),
         make=partial(_train, work, settings),
-        upstream=(*encoders.values(), *teacher, *walking(work, settings)),
+        upstream=(*encoders.values(), *teacher, *begun, *walking(work, settings)),
         scratch=("checkpoint.pt",),
         beside=("curve.csv", "kept", "kept.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
@@ -64,14 +68,35 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
 
 
 def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
-    project = work.project
-    key = f"{project.file(project.having(arm)[0])}: arms.{arm}.kickstart.teacher"
-    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if spec.trained}
-    if teacher not in trained:
-        raise RomnavError(f"{key}: no arm {teacher} that is trained{suggest(teacher, trained)}")
+    key = _trained(work, arm, "kickstart.teacher", teacher)
     if work.arm_settings(teacher).kickstart:
         raise RomnavError(f"{key}: {teacher} has a teacher itself; name one that was trained by PPO alone")
     return policy(work, teacher, seed)
+
+
+def _begun(work: Workspace, arm: str, begin: str, seed: int) -> Stage:
+    chain, above = [arm], begin
+    while above:
+        key = _trained(work, chain[-1], "begin", above)
+        if above in chain:
+            raise RomnavError(f"{key}: {' begins with '.join([*chain, above])}; one of them has to begin anew")
+        chain.append(above)
+        above = work.arm_settings(above).begin or ""
+    return policy(work, begin, seed)
+
+
+def _trained(work: Workspace, arm: str, setting: str, other: str) -> str:
+    """Where the ``setting`` of ``arm`` stands that names the ``other`` one.
+
+    Raises:
+        RomnavError: That is not trained.
+    """
+    project = work.project
+    key = f"{project.file(project.having(arm)[0])}: arms.{arm}.{setting}"
+    trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if spec.trained}
+    if other not in trained:
+        raise RomnavError(f"{key}: no arm {other} that is trained{suggest(other, trained)}")
+    return key
 
 
 def _encoders(work: Workspace, settings: Scale) -> dict[str, Stage]:
@@ -88,7 +113,7 @@ def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, pro
     from romnav.world.build import build
 
     world, seed = build(settings.world, work.project.worlds, progress), stage.seed or 0
-    teachers = [above.folder / "policy.pt" for above in stage.upstream if above.kind == "policy"]
+    others = {above.arm: above.folder / "policy.pt" for above in stage.upstream if above.kind == "policy"}
     path = train(
         settings.navigation,
         world,
@@ -96,7 +121,8 @@ def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, pro
         stage.folder,
         seed,
         body=body(work, settings, seed, session.device, settings.navigation.ppo.threads),
-        kickstart=None if settings.kickstart is None else (settings.kickstart, teachers[0]),
+        kickstart=(settings.kickstart, others[settings.kickstart.teacher]) if settings.kickstart else None,
+        begin=others[settings.begin] if settings.begin else None,
         device=session.device,
         resume=session.resume,
         progress=progress,

@@ -309,3 +309,57 @@ def test_the_navigation_test_drives_the_rom_on_the_dev_episodes(tmp_path: Path) 
     assert {"locomotion", "gait library"} <= {stage.name for stage in test.upstream}
     assert [path.name for path in test.reads] == ["dev.json"]
     assert test.outputs == ("navigation.json",)
+
+
+BEGIN = """
+kind = "ablation"
+title = "trained on"
+[arms.rom]
+label = "RoM"
+[arms.more]
+label = "on"
+begin = "rom"
+[arms.most]
+label = "on and on"
+begin = "more"
+[arms.walks]
+label = "driven"
+policy = "more"
+navigation.dynamics = "g1"
+"""
+
+
+def test_what_an_arm_begins_with_is_upstream_with_the_same_seed(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    here.project.file("on").write_text(BEGIN)
+    rom, more, most = (policy(here, arm, 3) for arm in ("rom", "more", "most"))
+    assert (rom in more.upstream, more in most.upstream, rom in most.upstream) == (True, True, False)
+    assert more.spec["begin"] == "rom"
+    assert "begin" not in rom.spec
+    assert policy(here, "walks", 3) == more
+    groups = waves([*rom.upstream, rom, more, most])
+    assert [[stage.arm for stage in group] for group in groups[-3:]] == [["rom"], ["more"], ["most"]]
+
+
+@pytest.mark.parametrize(
+    ("begin", "match"),
+    [
+        ("walks", "arms.more.begin: no arm walks that is trained"),
+        ("oracle", "arms.more.begin: no arm oracle that is trained"),
+        ("more", "arms.more.begin: more begins with more"),
+        ("most", "arms.most.begin: more begins with most begins with more"),
+    ],
+)
+def test_only_trained_arms_before_it_can_be_begun_with(tmp_path: Path, begin: str, match: str) -> None:
+    here = workspace(tmp_path)
+    here.project.file("on").write_text(BEGIN.replace('begin = "rom"', f'begin = "{begin}"'))
+    with pytest.raises(RomnavError, match=f"on.toml: {match}"):
+        policy(here, "more", 0)
+
+
+def test_a_run_begins_with_one_policy(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    text = KICKSTART.replace("concentration = 20.0", 'init = "teacher"\nbegin = "rom"')
+    here.project.file("on").write_text(text % "rom")
+    with pytest.raises(RomnavError, match="begin: the run cannot begin with rom and with its teacher"):
+        policy(here, "nav", 0)
