@@ -121,12 +121,48 @@ class Terms:
         return means
 
 
+class Average:
+    """Mean of a network's weights over the last ``share`` of its updates, more or less: by polynomial-decay averaging
+    (Shamir & Zhang, 2013), in which the t-th of n counts as t ** (1 / share - 1).
+
+    Attributes:
+        weights: By name, as in a state dict; empty before the first update.
+    """
+
+    def __init__(self, share: float) -> None:
+        self._share, self._count = share, 0
+        self.weights: dict[str, Tensor] = {}
+
+    def add(self, weights: dict[str, Tensor]) -> None:
+        """Take the weights after an update in; what is new among them, or no float, is as it is last."""
+        self._count += 1
+        for name, last in weights.items():
+            mean = self.weights.get(name)
+            if mean is None or not last.is_floating_point():
+                self.weights[name] = last.detach().clone()
+            else:
+                mean.lerp_(last, min(1.0 / (self._share * self._count), 1.0))
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` needs to go on."""
+        return {"count": self._count, "weights": self.weights}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a `state_dict`."""
+        self._count, self.weights = state["count"], state["weights"]
+
+
 class BoundedPPO(PPO):
-    """PPO whose adaptive learning rate stays within bounds, and whose loss may have further terms."""
+    """PPO whose adaptive learning rate stays within bounds, and whose loss may have further terms.
+
+    Attributes:
+        average: Of the actor's weights, if there is to be one.
+    """
 
     learning_rate_range = (0.0, float("inf"))
     symmetry: Terms
     storage: RolloutStorage
+    average: Average | None = None
 
     @property
     def learning_rate(self) -> float:
@@ -148,7 +184,25 @@ class BoundedPPO(PPO):
         """One update; its mean losses by name."""
         losses: dict[str, float] = super().update()
         losses.pop("symmetry", None)
+        if self.average:
+            self.average.add(self.actor.state_dict())
         return ranks.means(losses | self.symmetry.means())
+
+    def policy(self) -> dict[str, Tensor]:
+        """Weights of the actor as it is kept: the average, or the last ones."""
+        last: dict[str, Tensor] = self.actor.state_dict()
+        return self.average.weights or last if self.average else last
+
+    def save(self) -> dict[str, Any]:
+        """Everything that `load` needs to go on."""
+        average = {"average": self.average.state_dict()} if self.average else {}
+        return {**super().save(), **average}
+
+    def load(self, loaded_dict: dict[str, Any], load_cfg: dict | None, strict: bool) -> bool:
+        """Go on from what `save` returned."""
+        if self.average:
+            self.average.load_state_dict(loaded_dict["average"])
+        return bool(super().load(loaded_dict, load_cfg, strict))
 
     def begin(self, share: float) -> None:
         """Set everything that is scheduled once ``share`` of the run is done."""
@@ -226,5 +280,6 @@ def make_ppo(
     # one pass over all parameters instead of ten per tensor
     ppo.optimizer = torch.optim.Adam(chain(actor.parameters(), critic.parameters()), spec.learning_rate, fused=True)
     ppo.learning_rate_range = spec.learning_rate_range
+    ppo.average = Average(spec.average) if spec.average else None
     ppo.symmetry = Terms({"guidance": Guidance(spec.guidance)} if spec.guidance > 0.0 else {})
     return ppo

@@ -197,6 +197,9 @@ class PPOSpec(Config):
     keep: Count | None = None
     """Iterations after which the policy so far is kept beside the run, again and again (A: its success on the `dev`
     episodes shows progress where success while training depends on where the robots are let go)."""
+    average: Share = Field(default=0.0, exclude_if=lambda share: share == 0.0)
+    """Share of the updates so far, the last ones, over which the weights of the saved policy are averaged (P: 0, the
+    last weights alone; A: the noise of the last updates costs success)."""
     threads: Threads = 1
     """PyTorch threads of the run (A: another number gives other bits; two runs on a thread each do half as much again
     as one run on two)."""

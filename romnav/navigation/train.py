@@ -219,7 +219,7 @@ def _begin(path: Path, perception: Perception, ppo: BoundedPPO) -> None:
 
 
 def _save_policy(path: Path, identity: dict[str, Any], ppo: BoundedPPO, steps: int, seconds: float) -> None:
-    networks = {"actor": ppo.actor.state_dict(), "critic": ppo.critic.state_dict()}
+    networks = {"actor": ppo.policy(), "critic": ppo.critic.state_dict()}
     content = {**identity, **networks, "steps": steps, "hours": seconds / 3600}
     if ranks.size() > 1:
         content["processes"] = ranks.size()

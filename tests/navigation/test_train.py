@@ -156,6 +156,44 @@ def test_a_policy_to_begin_with_has_to_fit(
         train.train(spec, world, perception, tmp_path / "other", 1, begin=tmp_path / "none.pt")
 
 
+def averaging(spec: NavigationSpec, share: float) -> NavigationSpec:
+    return spec.model_copy(update={"ppo": spec.ppo.model_copy(update={"average": share, "keep": 1})})
+
+
+def test_what_is_saved_is_the_average_of_the_weights(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path
+) -> None:
+    train.train(averaging(spec, 0.0), world, perception, tmp_path / "last", 1)
+    train.train(averaging(spec, 1.0), world, perception, tmp_path / "mean", 1)
+    last, mean = (sorted((tmp_path / name / "kept").glob("*.pt")) for name in ("last", "mean"))
+    walked = [checkpoint.read(path)["actor"] for path in last]
+    for k, path in enumerate(mean):
+        for name, value in checkpoint.read(path)["actor"].items():
+            if value.is_floating_point():
+                expected = torch.stack([weights[name] for weights in walked[: k + 1]]).double().mean(0)
+                torch.testing.assert_close(value.double(), expected, atol=1e-5, rtol=1e-4)
+    assert_same(weights(tmp_path / "mean"), checkpoint.read(mean[-1])["actor"])
+    # what is saved has no part in the run
+    assert_same(checkpoint.read(mean[-1])["critic"], checkpoint.read(last[-1])["critic"])
+
+
+def test_an_averaging_run_resumes_exactly(
+    world: World, perception: object, spec: NavigationSpec, tmp_path: Path
+) -> None:
+    thawing = unfreezing(averaging(spec, 0.5), 0.5)
+
+    def stop(done: int, total: int, metric: str) -> None:
+        if done == total // 2:
+            signal.raise_signal(signal.SIGTERM)
+
+    train.train(thawing, world, perception, tmp_path / "whole", 1)
+    with pytest.raises(Stopped):
+        train.train(thawing, world, perception, tmp_path / "half", 1, progress=stop)
+    train.train(thawing, world, perception, tmp_path / "half", 1)
+    assert_same(weights(tmp_path / "whole"), weights(tmp_path / "half"))
+    assert any(name.startswith("encoder.") for name in weights(tmp_path / "half"))
+
+
 def unfreezing(spec: NavigationSpec, share: float) -> NavigationSpec:
     return spec.model_copy(update={"encoder": EncoderUseSpec(unfreeze_at=share)})
 
