@@ -4,13 +4,13 @@ A quoted number stands between two comments, of which the first tells where it c
 
     <!-- = results/bench/lidar-paper.json ours .0f -->411<!-- -->
     <!-- = results/cpu/locomotion/terrain.json terrain=ramp/crossed 100*.3g -->100<!-- -->
-    <!-- = results/smoke/tables/safety.csv "In-Distribution, CBF" collision .3g -->0<!-- -->
+    <!-- = results/cpu/tables/safety.csv "In-Distribution, CBF" collision .3g -->0<!-- -->
 
 A key of JSON leads through objects by name and through lists by a field that has a value or by position; several keys
 are added up. A row and a column lead to our first number in a table's CSV. The last word formats the number, times a
 factor if it begins so. A whole table is
 
-    <!-- = results/smoke/tables/safety.md -->
+    <!-- = results/cpu/tables/safety.md -->
     <!-- -->
 
 and `kept SCALE` in place of a file is the table of the policies kept along the runs of a scale, as judged on dev.
