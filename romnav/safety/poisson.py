@@ -112,13 +112,19 @@ def _discretise(
     wp.atomic_add(counts, b, count)
 
 
+@wp.func
+def _forcing(count: wp.vec3i, cell: float) -> float:
+    """cell^2 P / A, the perimeter by Cauchy-Crofton in four directions."""
+    perimeter = 0.125 * wp.pi * (float(count[1]) + float(count[2]) / wp.sqrt(2.0))
+    return cell * perimeter / float(wp.max(count[0], 1))
+
+
 @wp.kernel(enable_backward=False)
 def _sweep(
     weight: wp.array(dtype=float),
     counts: wp.array(dtype=wp.vec3i),
     active: wp.array(dtype=int),
     colour: int,
-    run: int,
     half: int,
     rows: int,
     plane: int,
@@ -126,29 +132,40 @@ def _sweep(
     omega: float,
     h: wp.array(dtype=float),
 ):
-    """Relax ``run`` consecutive cells of one colour in one row."""
-    b, i, block = wp.tid()
+    """Relax one cell of one colour."""
+    b, i, k = wp.tid()
     if active[b] == 0:
         return
-    # The perimeter by Cauchy-Crofton in four directions; rhs = cell^2 P / A.
-    count = counts[b]
-    perimeter = 0.125 * wp.pi * (float(count[1]) + float(count[2]) / wp.sqrt(2.0))
-    forcing = cell * perimeter / float(wp.max(count[0], 1))
-    stride = half + 2
-    start = block * run
-    row = (b * (rows + 2) + i + 1) * stride + 1 + start
-    length = wp.min(run, half - start)
-    _relax(
-        h,
-        weight,
-        colour * plane + row,
-        (1 - colour) * plane + row,
-        stride,
-        (i + colour) & 1,
-        length,
-        omega,
-        forcing,
-    )
+    row = (b * (rows + 2) + i + 1) * (half + 2) + 1 + k
+    own = colour * plane + row
+    other = (1 - colour) * plane + row
+    _relax(h, weight, own, other, half + 2, (i + colour) & 1, 1, omega, _forcing(counts[b], cell))
+
+
+@wp.kernel(enable_backward=False)
+def _sweep_grid(
+    weight: wp.array(dtype=float),
+    counts: wp.array(dtype=wp.vec3i),
+    fresh: wp.array(dtype=int),
+    sweeps: int,
+    more: int,
+    half: int,
+    rows: int,
+    plane: int,
+    cell: float,
+    omega: float,
+    h: wp.array(dtype=float),
+):
+    """All sweeps over one robot's grid, ``more`` of them if it is fresh: they stay in a core's cache."""
+    b = wp.tid()
+    forcing = _forcing(counts[b], cell)
+    for _ in range(sweeps + more * fresh[b]):
+        for colour in range(2):
+            for i in range(rows):
+                row = (b * (rows + 2) + i + 1) * (half + 2) + 1
+                own = colour * plane + row
+                other = (1 - colour) * plane + row
+                _relax(h, weight, own, other, half + 2, (i + colour) & 1, half, omega, forcing)
 
 
 @wp.kernel(enable_backward=False)
@@ -197,33 +214,19 @@ class PoissonSolver:
         self._h = torch.zeros(self.shape, device=device)
         self._layout = (half, plane)
         self._sweeps = spec.sweeps, max(0, spec.cold_sweeps - spec.sweeps)
-        # A processor core streams along a row; a GPU wants a thread per cell.
-        run = half if wp.get_device(device).is_cpu else 1
-        everyone = wp.ones(robots, dtype=int, device=device)
+        fresh, everyone = wp.from_torch(self._fresh), wp.ones(robots, dtype=int, device=device)
+        grid = half, rows, plane, cell, spec.omega
+
+        def recorded(kernel: wp.Kernel, dim: int | tuple[int, ...], *inputs: object) -> wp.Launch:
+            given = [self._weight, self._counts, *inputs, *grid]
+            return wp.launch(kernel, dim, given, [self._iterate], device=device, record_cmd=True)
+
+        # a core takes a grid at a time, a GPU wants a thread per cell
+        self._on_core = wp.get_device(device).is_cpu
+        self._sweep_grid = recorded(_sweep_grid, robots, fresh, *self._sweeps)
         self._sweep_all, self._sweep_fresh = (
-            [
-                wp.launch(
-                    _sweep,
-                    dim=(robots, rows, -(-half // run)),
-                    inputs=[
-                        self._weight,
-                        self._counts,
-                        active,
-                        colour,
-                        run,
-                        half,
-                        rows,
-                        plane,
-                        cell,
-                        spec.omega,
-                    ],
-                    outputs=[self._iterate],
-                    device=device,
-                    record_cmd=True,
-                )
-                for colour in (0, 1)
-            ]
-            for active in (everyone, wp.from_torch(self._fresh))
+            [recorded(_sweep, (robots, rows, half), active, colour) for colour in (0, 1)]
+            for active in (everyone, fresh)
         )
 
     def reset(self, robots: torch.Tensor | None = None) -> None:
@@ -242,6 +245,13 @@ class PoissonSolver:
         """(2, robots, rows + 2, columns / 2 + 2) view of both colours of the iterate."""
         robots, rows, _ = self.shape
         return wp.to_torch(self._iterate)[:-1].view(2, robots, rows + 2, self._layout[0] + 2)
+
+    def _sweep_cells(self) -> None:
+        warm, more = self._sweeps
+        for commands, sweeps in ((self._sweep_fresh, more * self._any_fresh), (self._sweep_all, warm)):
+            for _ in range(sweeps):
+                for command in commands:
+                    command.launch()
 
     def solve(self, occupied: torch.Tensor) -> torch.Tensor:
         """Safety function on the cells.
@@ -267,11 +277,10 @@ class PoissonSolver:
             outputs=[self._weight, self._iterate, self._counts],
             device=self._device,
         )
-        warm, extra = self._sweeps
-        for commands, sweeps in ((self._sweep_fresh, extra * self._any_fresh), (self._sweep_all, warm)):
-            for _ in range(sweeps):
-                for command in commands:
-                    command.launch()
+        if self._on_core:
+            self._sweep_grid.launch()
+        else:
+            self._sweep_cells()
         wp.launch(
             _unpack,
             dim=self.shape[:2],

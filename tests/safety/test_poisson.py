@@ -157,6 +157,19 @@ def test_warm_start_follows_a_moving_robot():
     assert ((h - exact).abs()[free].max() / exact.max()) < 5e-3
 
 
+def test_a_thread_per_cell_and_a_grid_per_core_give_the_same():
+    """The kernel of a GPU, here on the CPU, warm and cold."""
+    core, cells = (PoissonSolver(3, (41, 38), 0.05) for _ in range(2))
+    cells._on_core = False
+    for shift, fresh in ((0, []), (2, []), (4, [1]), (6, [0, 2])):
+        for solver in (core, cells):
+            solver.reset(torch.tensor(fresh, dtype=torch.long))
+        grids = worlds(3, 41, shift)[:, :, :38].contiguous()
+        a, b = core.solve(grids), cells.solve(grids)
+        assert torch.equal(a > 0, b > 0)
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+
+
 def test_robots_do_not_see_each_other():
     grids = worlds(3, 40)
     together = PoissonSolver(3, (40, 40), 0.05)
