@@ -11,6 +11,7 @@ import numpy as np
 
 from romnav import files
 from romnav.errors import RomnavError
+from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import NOISE
 from romnav.experiment.kinds.locomotion import body
@@ -58,10 +59,14 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
     if experiment.kind != "ablation":
         return []
     judged = {
-        label: tuple(path for seed in seeds if (path := work.folder / arm / f"seed-{seed}" / "kept.csv").exists())
+        label: tuple(
+            (path, _begun(work, arm, seed))
+            for seed in seeds
+            if (path := work.folder / arm / f"seed-{seed}" / "kept.csv").exists()
+        )
         for arm, label in experiment.labels.items()
     }
-    judged = {label: paths for label, paths in judged.items() if paths}
+    judged = {label: runs for label, runs in judged.items() if runs}
     if not judged:
         return []
     return [
@@ -74,18 +79,42 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             settings=experiment,
             uses=("labels",),
             make=partial(_draw, judged),
-            reads=tuple(path for paths in judged.values() for path in paths),
+            reads=tuple(
+                path
+                for runs in judged.values()
+                for kept, begun in runs
+                for path in (kept, *(policy.record for policy in begun))
+            ),
         )
     ]
 
 
-def _draw(judged: Mapping[str, tuple[Path, ...]], stage: Stage, session: Session, progress: Progress) -> dict[str, Any]:
-    """Of the mean over training seeds at each number of steps."""
+def _begun(work: Workspace, arm: str, seed: int) -> tuple[Stage, ...]:
+    """The policy that a run begins with, after those behind it."""
+    begin = work.arm_settings(arm).begin
+    if not begin:
+        return ()
+    behind = policy(work, begin, seed)  # refuses a circle
+    return (*_begun(work, begin, seed), behind)
+
+
+def _draw(
+    judged: Mapping[str, tuple[tuple[Path, tuple[Stage, ...]], ...]],
+    stage: Stage,
+    session: Session,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Of the mean over training seeds at each number of steps, those of what a run begins with included."""
     import pandas as pd
 
     from romnav.report.paired.progress import draw, read
 
-    frames = {label: pd.concat([read(path) for path in paths]) for label, paths in judged.items()}
+    def whole(kept: Path, begun: tuple[Stage, ...]) -> pd.DataFrame:
+        rows, found = read(kept), [record.facts for policy in begun if (record := records.read(policy))]
+        before = {name: sum(facts.get(name, 0.0) for facts in found) for name in ("steps", "hours")}
+        return rows.assign(**{name: rows[name] + spent for name, spent in before.items()})
+
+    frames = {label: pd.concat([whole(*run) for run in runs]) for label, runs in judged.items()}
     means = {label: frame.groupby("steps", as_index=False).mean(numeric_only=True) for label, frame in frames.items()}
     draw(means, stage.folder / stage.outputs[0])
     return {}

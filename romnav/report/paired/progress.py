@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from matplotlib.figure import Figure
 from romnav.errors import RomnavError
 from romnav.report.formats import literal
 
-COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b")
+COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b", "#7b5aa6", "#c99700", "#4bacc6")
 PANELS = (
     ("steps", "sr_120_same", "same level, 120 s"),
     ("steps", "sr_120_cross", "across levels, 120 s"),
@@ -51,7 +52,7 @@ def draw(arms: Mapping[str, pd.DataFrame], path: Path) -> None:
     figure = Figure(figsize=(10.0, 3.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(PANELS)))
     for panel, (over, column, title) in zip(axes, PANELS, strict=True):
-        for colour, (label, rows) in zip(COLOURS, arms.items(), strict=False):
+        for colour, (label, rows) in zip(cycle(COLOURS), arms.items(), strict=False):
             gain = slope(rows["steps"], rows[column])
             told = label if np.isnan(gain) else f"{label} ({gain:+.1f} a doubling)"
             x = rows["steps"] / 1e6 if over == "steps" else rows[over]

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict
@@ -14,12 +15,15 @@ from romnav.errors import RomnavError
 from romnav.evaluation import episodes
 from romnav.evaluation.paired.progress import read
 from romnav.evaluation.spec import EpisodeSetSpec
+from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session
 from romnav.experiment.kinds import kept as module
+from romnav.experiment.kinds import policy as policies
 from romnav.experiment.kinds.kept import kept, reports
 from romnav.experiment.workspace import Workspace
 from romnav.navigation import checkpoint
 from romnav.navigation.ppo import make_actor
+from romnav.report.paired import progress
 from romnav.world.build import build
 from romnav.world.spec import SamplerSpec, WorldSpec
 from tests.experiment import conftest
@@ -98,3 +102,38 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
             assert 0.0 <= float(row[f"sr_45_{level}"]) <= float(row[f"sr_120_{level}"]) <= 100.0
         whole = (float(row["sr_120_same"]) + float(row["sr_120_cross"])) / 2
         assert float(row["sr_120_all"]) == pytest.approx(whole)
+
+
+ON = """
+kind = "ablation"
+title = "trained on"
+[arms.rom]
+label = "RoM"
+[arms.more]
+label = "on"
+begin = "rom"
+[arms.most]
+label = "on and on"
+begin = "more"
+"""
+
+
+def test_what_a_run_begins_with_is_counted(work: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    work.project.file("on").write_text(ON)
+    monkeypatch.setattr(progress, "draw", lambda arms, path: drawn.update(arms))
+    drawn: dict[str, pd.DataFrame] = {}
+    for arm, steps in (("rom", 500), ("more", 300), ("most", 100)):
+        stage = policies.policy(work, arm, 0)
+        record = records.begin(stage, True)
+        (stage.folder / "kept.csv").write_text(f"steps,hours,sr_120_all\n{steps / 2},0.5,60.0\n{steps},1.0,70.0\n")
+        for name in stage.outputs:
+            (stage.folder / name).write_text("made")
+        records.finish(stage, record, {"steps": steps, "hours": 1.0}, 0.0)
+    (figure,) = reports(work, "on", [0])
+    figure.make(figure, Session(), lambda done, total, text: None)
+    assert {label: list(rows["steps"]) for label, rows in drawn.items()} == {
+        "RoM": [250.0, 500.0],
+        "on": [650.0, 800.0],
+        "on and on": [850.0, 900.0],
+    }
+    assert list(drawn["on and on"]["hours"]) == [2.5, 3.0]
