@@ -25,11 +25,7 @@ GRACE = 60.0
 
 
 class Queue(Protocol):
-    """Where tasks put (stage, line of progress)."""
-
-    def put(self, item: tuple[str, str] | None) -> None:
-        """Append."""
-        ...
+    """Where (stage, line of progress) arrive from tasks."""
 
     def get(self) -> tuple[str, str] | None:
         """Wait for the next; None is the last."""
@@ -81,7 +77,7 @@ def execute_on_ray(
         for stage in stages:
             above = [running[other.name] for other in stage.upstream if other.name in running]
             running[stage.name] = task.options(name=stage.name).remote(
-                stage, session, queue, Path.cwd(), sys.argv, *above
+                stage, session, queue.actor, Path.cwd(), sys.argv, *above
             )
             say(stage.name)
         with lines(list(running)) as show:
@@ -129,8 +125,8 @@ def _show(queue: Queue, show: Callable[[str, str], None]) -> None:
             show(*item)
 
 
-def _run(stage: Stage, session: Session, queue: Queue, folder: Path, command: list[str], *above: None) -> None:
-    """In a worker: the stage, once those ``above`` are done."""
+def _run(stage: Stage, session: Session, queue: Any, folder: Path, command: list[str], *above: None) -> None:
+    """In a worker: the stage, once those ``above`` are done; ``queue`` is the queue's actor."""
     os.chdir(folder)
     sys.argv = command
     with contextlib.redirect_stderr(_Lines(stage.name, queue)):
@@ -138,14 +134,17 @@ def _run(stage: Stage, session: Session, queue: Queue, folder: Path, command: li
 
 
 class _Lines(io.TextIOBase):
-    """A stream whose lines go to a queue under the name of a stage."""
+    """A stream whose lines go to a queue's actor under the name of a stage.
 
-    def __init__(self, name: str, queue: Queue) -> None:
+    Nothing waits for them to arrive: while a task waits, Ray gives its core to another one.
+    """
+
+    def __init__(self, name: str, queue: Any) -> None:
         self._name, self._queue, self._rest = name, queue, ""
 
     def write(self, text: str) -> int:
         *whole, self._rest = (self._rest + text).split("\n")
         for line in filter(None, whole):
             with contextlib.suppress(Exception):  # that nobody is told of it stops no stage
-                self._queue.put((self._name, line))
+                self._queue.put_nowait.remote((self._name, line))
         return len(text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -43,6 +44,15 @@ def count(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
         state.with_suffix(".new").replace(state)
         progress(step + 1, STEPS, "counted")
     return write(this, session, progress)
+
+
+def tell_when(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
+    """Has much to say, and tells when it ran."""
+    begun = time.time()
+    for step in range(STEPS):
+        time.sleep(0.2)  # long enough for another worker to start meanwhile
+        print(*range(20), sep="\n", file=sys.stderr)
+    return write(this, session, progress) | {"span": [begun, time.time()]}
 
 
 def save_when_asked(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
@@ -103,6 +113,14 @@ def test_stages_run_in_order_and_survive_a_machine(
     assert sorted(len((one.folder / "processes").read_text().split()) for one in long) == [1, 2]
     assert not pending([last])
     assert "counted" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_no_more_stages_run_at_once_than_there_are_cores(tmp_path: Path, cluster: Any) -> None:
+    stages = [stage(tmp_path, key, Settings(), make=tell_when) for key in "abcd"]
+    execute_on_ray("ray", NEEDS, stages, Session(), print)
+    spans = [records.read(one).facts["span"] for one in stages]
+    assert max(sum(begun <= start < ended for begun, ended in spans) for start, _ in spans) <= 2
 
 
 @pytest.mark.slow
