@@ -49,7 +49,7 @@ def count(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
 def tell_when(this: Stage, session: Session, progress: Progress) -> dict[str, Any]:
     """Has much to say, and tells when it ran."""
     begun = time.time()
-    for step in range(STEPS):
+    for _ in range(STEPS):
         time.sleep(0.2)  # long enough for another worker to start meanwhile
         print(*range(20), sep="\n", file=sys.stderr)
     return write(this, session, progress) | {"span": [begun, time.time()]}
