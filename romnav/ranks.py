@@ -37,6 +37,7 @@ def joined(device: str) -> Iterator[str]:
     if started() == 1:
         yield device
         return
+    import tensordict  # noqa: F401  # before the group: its functions keep the one that is there, and so gloo's threads
     import torch
     from torch import distributed
 

@@ -149,12 +149,11 @@ def work(folder: Path) -> None:
         assert rank == 0 or ranks.hear() is None
 
 
-def together(folder: Path) -> None:
-    """Runs `work` in processes with the variables that torchrun gives them."""
+def together(script: str) -> None:
+    """Runs a script in processes with the variables that torchrun gives them."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    script = f"from pathlib import Path; from tests.test_ranks import work; work(Path({str(folder)!r}))"
     shared = {"WORLD_SIZE": str(PROCESSES), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     shared |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
     running = [
@@ -175,7 +174,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         obs = rollout(ppo, env)
         save_rollout(folder / "rollout", ppo, obs)
         torch.save(update(ppo, obs), folder / "alone")
-    together(folder)
+    together(f"from pathlib import Path; from tests.test_ranks import work; work(Path({str(folder)!r}))")
     return folder
 
 
@@ -229,6 +228,24 @@ def test_what_cannot_be_shared_is_refused(made: Path) -> None:
 def test_another_number_of_processes_does_not_go_on(made: Path) -> None:
     with pytest.raises(RomnavError, match=r"checkpoint\.pt: belongs to a run of 2 processes, and here are 1; start as"):
         train(SPEC, build(WORLD, made), FakePerception(), made, 1)
+
+
+LEAVE = """
+from pathlib import Path
+from romnav import ranks
+with ranks.joined("cpu"):
+    from romnav.navigation import train
+    assert ranks.rank() == 0 or ranks.hear() is None
+threads = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
+assert not [name for name in threads if "gloo" in name], threads
+"""
+"""Joins before it imports what trains, as the command line does."""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux names a process's threads there")
+def test_no_thread_of_the_group_outlives_it() -> None:
+    """One that does may be at work when Python ends, which aborts the process."""
+    together(LEAVE)
 
 
 def test_variables_without_the_rest_are_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
