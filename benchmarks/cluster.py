@@ -94,12 +94,12 @@ def simulate(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("experiments", nargs="*", default=["spawn-goal", "pretrain", "kickstart"])
+    parser.add_argument("experiments", nargs="*", default=["spawn-goal", "pretrain", "kickstart", "careful"])
     parser.add_argument("--scale", default="cpu")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--cores", type=int, nargs="+", default=[2, 8, 64, 1000])
     parser.add_argument("--rom", type=float, default=7800.0, help="nav-steps/s of a core on the reduced-order model")
-    parser.add_argument("--g1", type=float, default=300.0, help="nav-steps/s of a core on the humanoid")
+    parser.add_argument("--g1", type=float, default=500.0, help="nav-steps/s of a core on the humanoid")
     parser.add_argument("--spread", type=float, default=0.1)
     parser.add_argument("--mtbf-hours", type=float, default=500.0)
     parser.add_argument("--out", type=Path, default=ROOT / "results/bench")
