@@ -98,10 +98,14 @@ def main() -> None:
     parser.add_argument("--scale", default="cpu")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--cores", type=int, nargs="+", default=[2, 8, 64, 1000])
-    parser.add_argument("--rom", type=float, default=7800.0, help="nav-steps/s of a core on the reduced-order model")
-    parser.add_argument("--g1", type=float, default=500.0, help="nav-steps/s of a core on the humanoid")
+    parser.add_argument(
+        "--rom", type=float, default=7800.0, help="nav-steps/s of a core, or GPU, on the reduced-order model"
+    )
+    parser.add_argument("--g1", type=float, default=500.0, help="the same on the humanoid")
     parser.add_argument("--spread", type=float, default=0.1)
     parser.add_argument("--mtbf-hours", type=float, default=500.0)
+    parser.add_argument("--unit", default="core", choices=["core", "GPU"])
+    parser.add_argument("--name", default="cluster", help="of the file")
     parser.add_argument("--out", type=Path, default=ROOT / "results/bench")
     given = parser.parse_args()
 
@@ -113,10 +117,10 @@ def main() -> None:
     lasts = {stage.name: seconds(stage, Rates(given.rom, given.g1)) for stage in stages}
     lines = [
         f"Simulated: {', '.join(given.experiments)} at scale {given.scale}, {given.seeds} seeds, {len(stages)} stages. "
-        f"A core does {given.rom:g} nav-steps/s on the reduced-order model and {given.g1:g} on the humanoid. Hours, "
-        "mean and range of 50 runs.",
+        f"A {given.unit} does {given.rom:g} nav-steps/s on the reduced-order model and {given.g1:g} on the humanoid. "
+        "Hours, mean and range of 50 runs.",
         "",
-        "| cores | hours | range | cores at work |",
+        f"| {given.unit}s | hours | range | {given.unit}s at work |",
         "| --- | --- | --- | --- |",
     ]
     for cores in given.cores:
@@ -125,7 +129,7 @@ def main() -> None:
         busy = np.mean([total / (makespan * cores) for makespan, total in runs])
         lines.append(f"| {cores} | {hours.mean():.1f} | {hours.min():.1f} to {hours.max():.1f} | {busy:.0%} |")
     text = "\n".join(lines) + f"\n\nCommit {records.commit()[:12]}.\n"
-    files.write(given.out / "cluster.md", text)
+    files.write(given.out / f"{given.name}.md", text)
     print(text)
 
 
