@@ -207,9 +207,15 @@ def _begin(path: Path, perception: Perception, ppo: BoundedPPO) -> None:
     """Give actor and critic the weights that the policy of ``path`` and its critic have."""
     depth = perception.depth.encoder if perception.depth else None
     with torch.random.fork_rng():  # the weights that a network is made with are drawn, and the run's draws go on
-        given = checkpoint.load_actor(path, perception.encoder, depth_encoder=depth), checkpoint.load_critic(path)
-    for own, other in zip((ppo.actor, ppo.critic), given, strict=True):
-        weights = other.state_dict() if other else {}
+        actor = checkpoint.load_actor(path, perception.encoder, depth_encoder=depth)
+        critic = checkpoint.load_critic(path)
+    if critic is None:
+        raise RomnavError(
+            f"{path}: has no critic to begin with; train that arm again, or be taught by it "
+            "(kickstart.teacher, kickstart.init = 'teacher')"
+        )
+    for own, other in ((ppo.actor, actor), (ppo.critic, critic)):
+        weights = other.state_dict()
         if {n: w.shape for n, w in weights.items()} != {n: w.shape for n, w in own.state_dict().items()}:
             raise RomnavError(
                 f"{path}: a run that begins with it needs the same networks and senses; give both arms the same "

@@ -154,6 +154,11 @@ def test_a_policy_to_begin_with_has_to_fit(
             train.train(other, world, perception, tmp_path / "other", 1, begin=first)
     with pytest.raises(RomnavError, match="no such policy"):
         train.train(spec, world, perception, tmp_path / "other", 1, begin=tmp_path / "none.pt")
+    content = checkpoint.read(first)
+    del content["critic"]
+    checkpoint.save(tmp_path / "actor.pt", content)
+    with pytest.raises(RomnavError, match="has no critic to begin with; train that arm again, or be taught by it"):
+        train.train(spec, world, perception, tmp_path / "other", 1, begin=tmp_path / "actor.pt")
 
 
 def averaging(spec: NavigationSpec, share: float) -> NavigationSpec:
