@@ -33,7 +33,7 @@ def test_metrics_have_names_units_and_directions(project: Path) -> None:
 
 
 def test_list_shows_the_others_beside_a_broken_file(evaluated: Path) -> None:
-    broken = evaluated / "experiments" / "search.toml"
+    broken = evaluated / "experiments" / "stair-limits.toml"
     edit(broken, "title =", "titel =")
     (evaluated / "results" / "smoke" / "rom" / "seed-0.bak").mkdir()
     (evaluated / "results" / "smoke" / "rom" / "seed-0.bak" / "episodes.parquet").write_bytes(b"old")
