@@ -146,7 +146,9 @@ def table(found: dict) -> str:
         ["the same, simulated", f"{found['simulated']:.0f}", ""],
         ["one machine killed half-way", f"{found['killed']:.0f}", "yes" if found["same_rows_after_kill"] else "no"],
     ]
-    head = f"{found['work']}. Ray takes {found['overhead']:+.1%} of the time. Load {found['load']:.1f}.\n\n"
+    head = (
+        f"{found['work']}. With Ray it takes {1.0 + found['overhead']:.2f} times as long. Load {found['load']:.1f}.\n\n"
+    )
     return head + markdown(["", "seconds", "same rows"], lines)
 
 
