@@ -69,7 +69,7 @@ def scale(
     spec = settings.navigation
     rows = [{"part": part, "mb": f"{size:,.1f}"} for part, size in parts.items()]
     print_table(f"Memory of {name}", rows, {"part": "part", "mb": "MB"})
-    typer.echo(f"{spec.env.envs:,} robots x {spec.ppo.steps} steps, {settings.world.tiles} tiles")
+    typer.echo(f"{spec.env.envs:,} robots x {spec.ppo.steps} steps, {settings.ground.tiles} tiles")
     typer.echo("activations of an update are not counted")
 
 

@@ -43,14 +43,14 @@ def describe_world(work: Workspace, experiment: str, progress: Progress | None =
     for arm in work.project.experiment(experiment).arms:
         settings = work.arm_settings(arm)
         shared = shared or settings
-        if settings.world != shared.world:
+        if settings.ground != shared.ground:
             raise RomnavError(
-                f"{work.project.file(experiment)}: arms.{arm}.world differs from the first arm's; "
-                "describe an experiment whose arms share one world"
+                f"{work.project.file(experiment)}: arms.{arm} has another terrain (world, navigation.tiles) than the "
+                "first arm; describe an experiment whose arms share one world"
             )
         if settings.navigation.env.sampler not in samplers.values():
             samplers[arm] = settings.navigation.env.sampler
     if shared is None:
         raise RomnavError(f"{work.project.file(experiment)}: key arms is empty")
-    world = build(shared.world, work.project.worlds, progress)
+    world = build(shared.ground, work.project.worlds, progress)
     return Description(measure(world, samplers, shared.navigation.env, shared.evaluation), tally(world))

@@ -50,7 +50,7 @@ def footprint(settings: Scale) -> dict[str, float]:
     weights = [*ppo.actor.parameters(), *ppo.critic.parameters()]
     share = spec.env.envs / ROBOTS
     sizes = {
-        "world": _bytes(vars(world).values()) * settings.world.tiles / tiles,
+        "world": _bytes(vars(world).values()) * settings.ground.tiles / tiles,
         "robots": (_bytes(env.state_dict().values()) + _bytes(obs.values())) * share,
         "images of a step": settings.lidar.rows * settings.lidar.columns * FLOAT * spec.env.envs,
         "rollout": _rollout(ppo.storage, obs) * share,

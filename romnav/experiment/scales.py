@@ -37,7 +37,7 @@ class Scale(Config):
     """The settings of every part; the defaults are the paper's, or assumed where it is silent."""
 
     world: WorldSpec = WorldSpec()
-    """Training terrain."""
+    """Training terrain, of encoders and, but for its number of tiles, of policies."""
     lidar: LidarSpec = LidarSpec()
     """Range image."""
     pretrain: PretrainSpec = PretrainSpec()
@@ -89,6 +89,11 @@ class Scale(Config):
                     f"{MOST_STEPS:,} steps"
                 )
         return self
+
+    @property
+    def ground(self) -> WorldSpec:
+        """The terrain that policies are trained on: ``world``, with as many tiles as ``navigation.tiles`` says."""
+        return self.world.model_copy(update={"tiles": self.navigation.tiles or self.world.tiles})
 
     def on_body(self, own: NavigationSpec) -> Scale:
         """The same with robots of another body."""

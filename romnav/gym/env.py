@@ -75,7 +75,7 @@ class RoMVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         seen: tuple[Sight, ...] = (sight,) if isinstance(sight, str) else tuple(sight)
         if unknown := set(seen) - set(get_args(Sight)):
             raise RomnavError(f"sight: unknown {', '.join(sorted(unknown))}; there are {', '.join(get_args(Sight))}")
-        self._world = build(settings.world, work.project.worlds).to(device)
+        self._world = build(settings.ground, work.project.worlds).to(device)
         self._device = device
         self._eyes = {name: self._eye(work, settings, name) for name in seen}
         env = settings.navigation.env.model_copy(update={"envs": num_envs})

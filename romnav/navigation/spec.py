@@ -259,6 +259,9 @@ class NavigationSpec(Config):
     stair_limits: tuple[Positive, Positive] | None = Field(default=None, exclude_if=lambda limits: limits is None)
     """Fastest forward command, m/s, and turn, rad/s, that the humanoid follows while its next foothold is not level
     with its feet (A: none, as in the paper)."""
+    tiles: int | None = Field(default=None, ge=1, le=2**16, exclude_if=lambda tiles: tiles is None)
+    """Number of tiles to train on where it is not ``world.tiles``, on which encoders are trained, too; of the same seed
+    (A: none; a long run learns few tiles by heart)."""
     corruption: CorruptionSpec = CorruptionSpec(dropout=(0.0, 0.1))
     """What is done to the range images that the policy sees (A: a running sensor loses far fewer pixels than
     pretraining drops)."""

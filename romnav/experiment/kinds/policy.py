@@ -112,7 +112,7 @@ def _train(work: Workspace, settings: Scale, stage: Stage, session: Session, pro
     from romnav.navigation.train import train
     from romnav.world.build import build
 
-    world, seed = build(settings.world, work.project.worlds, progress), stage.seed or 0
+    world, seed = build(settings.ground, work.project.worlds, progress), stage.seed or 0
     others = {above.arm: above.folder / "policy.pt" for above in stage.upstream if above.kind == "policy"}
     path = train(
         settings.navigation,
