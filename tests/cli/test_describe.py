@@ -63,10 +63,11 @@ def test_a_bad_world_is_one_line_before_anything_is_built(small: Path) -> None:
     assert "unknown experiment" in fails("describe", "world", "--experiment", "nothing")
 
 
-def test_arms_on_other_terrain_have_no_one_world(small: Path) -> None:
+@pytest.mark.parametrize("terrain", ["world.seed", "navigation.tiles"])
+def test_arms_on_other_terrain_have_no_one_world(small: Path, terrain: str) -> None:
     file = small / "experiments" / "spawn-goal.toml"
-    edit(file, "[arms.nocap]", "[arms.nocap]\nworld.seed = 4")
-    assert "arms.nocap.world differs" in fails("describe", "world", "--scale", "mine")
+    edit(file, "[arms.nocap]", f"[arms.nocap]\n{terrain} = 4")
+    assert "arms.nocap has another terrain" in fails("describe", "world", "--scale", "mine")
 
 
 def test_memory_of_a_scale_is_that_of_the_run(small: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from romnav.errors import RomnavError
 from romnav.experiment.graph.run import waves
-from romnav.experiment.graph.stage import Stage
+from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds import reports, trials
 from romnav.experiment.kinds.encoder import encoder, quality
 from romnav.experiment.kinds.episodes import episodes
@@ -17,6 +17,7 @@ from romnav.experiment.kinds.navigation import navigation
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.project import Project
 from romnav.experiment.workspace import Workspace
+from romnav.world.spec import WorldSpec
 from tests.experiment import conftest
 
 ROOT = Path(__file__).parents[3]
@@ -116,6 +117,25 @@ def test_arms_share_the_settings_of_trials(tmp_path: Path) -> None:
     here.project.file("more").write_text('kind = "safety"\ntitle = "t"\n[arms.own]\nlabel = "Own"\nsafety.trials = 3\n')
     with pytest.raises(RomnavError, match=r"arms\.own\.safety: set \[safety\] of the scale"):
         trials.trials(here, "safety", "own", 0)
+
+
+def test_policies_are_trained_on_tiles_of_their_own_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = everything(report(workspace(tmp_path), "spawn-goal", [0]))
+    here = workspace(tmp_path, SCALE + "[navigation]\ntiles = 9\n")
+    after = everything(report(here, "spawn-goal", [0]))
+    assert {name for name in before if before[name] != after[name]} == TRAINED | EVALUATED | TABLES
+    built = []
+
+    def build(spec: WorldSpec, *_: object) -> None:
+        built.append(spec)
+        raise RomnavError("built")
+
+    monkeypatch.setattr("romnav.world.build.build", build)
+    trained = policy(here, "rom", 0)
+    for stage in (trained, *trained.upstream):
+        with pytest.raises(RomnavError, match="built"):
+            stage.make(stage, Session(), lambda *_: None)
+    assert built == [WorldSpec(tiles=9), WorldSpec(tiles=4)]
 
 
 def test_the_arms_share_one_encoder(tmp_path: Path) -> None:
