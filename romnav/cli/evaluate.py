@@ -29,6 +29,7 @@ KEPT_COLUMNS = {
     "sr_120_storey": "storeys",
     "spl": "SPL",
 }
+SEEN_COLUMNS = {"arm": "arm", "terrain": "terrain", "tiles": "tiles", **dict(list(KEPT_COLUMNS.items())[2:])}
 RESULT_COLUMNS = {
     "arm": "arm",
     "seed": "seed",
@@ -96,6 +97,10 @@ def evaluate(
     along: Annotated[
         bool, typer.Option("--kept", help="Judge what an arm's run has kept on the way, on the episodes for choices.")
     ] = False,
+    generalization: Annotated[
+        bool,
+        typer.Option("--generalization", help="Hold the terrain that an arm was trained on against unseen terrain."),
+    ] = False,
     joints: Annotated[
         bool, typer.Option("--joints", help="Keep the humanoid's joints beside its tracks, for the viewer and films.")
     ] = False,
@@ -116,8 +121,13 @@ def evaluate(
         raise RomnavError("name arms, or compare all that are trained by `romnav eval --paired`; see `romnav list`")
     if joints and (along or not names):
         raise RomnavError("--joints: are those of evaluated arms; name arms on the humanoid, without --kept")
+    if generalization and (along or paired or joints):
+        raise RomnavError("--generalization: is of each arm by itself; leave --kept, --paired and --joints out")
     if along:
         _judge_kept(job, names, seed)
+        return
+    if generalization:
+        _judge_seen(job, names, seed)
         return
     if navigation and "locomotion" not in names:
         raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
@@ -202,6 +212,21 @@ def _judge_kept(job: DeviceJob, names: list[str], seed: int | None) -> None:
         for row in read(stage.folder / stage.outputs[0])
     ]
     print_table("Success of kept policies in percent", rows, KEPT_COLUMNS)
+
+
+def _judge_seen(job: DeviceJob, names: list[str], seed: int | None) -> None:
+    from romnav.experiment.graph.run import require
+    from romnav.experiment.kinds.generalization import generalization
+
+    stages = [
+        generalization(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))
+    ]
+    for stage in stages:
+        require(stage.upstream[-1], stage)
+    job.make(stages)
+    read = ((stage, json.loads((stage.folder / stage.outputs[0]).read_text("utf-8"))) for stage in stages)
+    rows = [{"arm": stage.arm} | row for stage, found in read for row in found]
+    print_table("Success in percent, on the terrain of training and on unseen terrain", rows, SEEN_COLUMNS)
 
 
 def _test_terrain(job: DeviceJob) -> None:

@@ -62,6 +62,8 @@ def test_each_arm_is_compared_with_its_experiments_reference(evaluated: Path) ->
 def test_what_cannot_be_compared_is_one_clear_error(project: Path) -> None:
     assert fails("eval", "rom", "uniform", "rom") == "rom is named twice; name each arm once"
     assert fails("eval", "--paired", "rom").startswith("--paired compares arms: name one beside rom, or none")
+    assert fails("eval", "--paired", "--generalization").startswith("--generalization: is of each arm by itself")
+    assert "policy rom, seed 0 is missing, and generalization" in fails("eval", "rom", "--generalization")
     assert fails("eval").startswith("name arms, or compare all that are trained by `romnav eval --paired`")
     assert fails("eval", "--paired").endswith("no arm is trained; run `romnav run ablation spawn-goal --scale smoke`")
 

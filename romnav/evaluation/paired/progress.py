@@ -10,8 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from romnav.evaluation.episodes import EpisodeSet
+from romnav.evaluation.paired.failures import classify
 from romnav.evaluation.paired.metrics import LEVELS, evaluate
-from romnav.world.world import STOREY
+from romnav.evaluation.paired.run import run
+from romnav.evaluation.rollout import Driver
+from romnav.evaluation.spec import EvaluationSpec
+from romnav.evaluation.tracks import Recorder
+from romnav.navigation.spec import EnvSpec
+from romnav.progress import Progress
+from romnav.robot.dynamics import Body
+from romnav.world.world import STOREY, World
 
 COLUMNS = (
     *("policy", "episodes", "iteration", "steps", "hours"),
@@ -20,6 +29,23 @@ COLUMNS = (
 )
 """Digests of policy and episode set, place in the run, success rates in percent by level and over climbs of a storey
 or more, SPL, and time to goal in s."""
+
+
+def judge(
+    driver: Driver,
+    world: World,
+    episodes: EpisodeSet,
+    env: EnvSpec,
+    spec: EvaluationSpec,
+    progress: Progress,
+    body: Body,
+) -> dict[str, float]:
+    """The `row` of a driver, which walks all ``episodes`` as `romnav.evaluation.paired.run` has it."""
+    recorder = Recorder()
+    measured = run(driver, world, episodes, env, spec, progress, body, recorder)
+    walked = {**episodes.columns, "level": np.where(episodes.cross, "cross", "same"), **measured}
+    where, how = classify(recorder.tracks(len(episodes)), walked, world, env.period)
+    return row({**walked, "where": where, "how": how})
 
 
 def row(columns: Mapping[str, NDArray]) -> dict[str, float]:

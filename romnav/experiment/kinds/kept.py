@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from romnav import files
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
@@ -126,10 +124,7 @@ def _judge(
     """Those that were judged before are not walked again."""
     from romnav.evaluation.episodes import load, terrain
     from romnav.evaluation.paired import progress as along
-    from romnav.evaluation.paired.failures import classify
-    from romnav.evaluation.paired.run import run
     from romnav.evaluation.rollout import Policy
-    from romnav.evaluation.tracks import Recorder
     from romnav.navigation import checkpoint
 
     settings, path = work.arm_settings(str(trained.arm)), stage.reads[0]
@@ -141,20 +136,16 @@ def _judge(
     rows: dict[str, Mapping[str, Any]] = {
         row["policy"]: row for row in along.read(stage.folder / "kept.csv") if row["episodes"] == episodes.digest
     }
-    columns = {**episodes.columns, "level": np.where(episodes.cross, "cross", "same")}
     for file in policies:
         name = digest(file)[:16]
         if name in rows:
             continue
         driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
         robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
-        env, recorder = settings.navigation.env, Recorder()
-        measured = run(driver, world, episodes, env, settings.evaluation, progress, robots, recorder)
-        walked = columns | measured
-        where, how = classify(recorder.tracks(len(episodes)), walked, world, env.period)
+        env, spec = settings.navigation.env, settings.evaluation
         saved = checkpoint.read(file)
         place = {"policy": name, "episodes": episodes.digest, "iteration": int(file.stem)}
         place |= {"steps": saved["steps"], "hours": saved["hours"]}
-        rows[name] = place | along.row({**walked, "where": where, "how": how})
+        rows[name] = place | along.judge(driver, world, episodes, env, spec, progress, robots)
         files.write(stage.folder / "kept.csv", files.csv_text(list(rows.values()), along.COLUMNS))
     return {"policies": len(policies)}
