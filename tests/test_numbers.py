@@ -38,6 +38,18 @@ def test_numbers_are_read_from_json_csv_and_tables(tmp_path: Path, monkeypatch: 
     assert numbers.written(text) == text
 
 
+def test_arms_are_shown_on_seen_and_unseen_terrain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numbers, "ROOT", tmp_path)
+    folder = tmp_path / "results" / "tiny" / "rom" / "seed-1"
+    folder.mkdir(parents=True)
+    rates = [f"sr_{horizon}_{level}" for horizon in (45, 120) for level in ("all", "cross")]
+    rows = [{"tiles": 96 - k, **{rate: 10.0 * i + k for i, rate in enumerate(rates)}} for k in (0, 1)]
+    (folder / "generalization.json").write_text(json.dumps(rows))
+    table = numbers.value("generalization tiny").strip().splitlines()
+    assert table[0] == "| arm | seed | tiles | SR@45 | SR@45, cross level | SR@120 | SR@120, cross level |"
+    assert table[2:] == ["| rom | 1 | 96 | 0.0, 1.0 | 10.0, 11.0 | 20.0, 21.0 | 30.0, 31.0 |"]
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -48,6 +60,7 @@ def test_numbers_are_read_from_json_csv_and_tables(tmp_path: Path, monkeypatch: 
         "a.json l/k=2 .1f",
         "t.txt x .1f",
         "kept nowhere",
+        "generalization nowhere",
     ],
 )
 def test_a_source_that_is_not_there_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:

@@ -13,7 +13,8 @@ factor if it begins so. A whole table is
     <!-- = results/cpu/tables/safety.md -->
     <!-- -->
 
-and `kept SCALE` in place of a file is the table of the policies kept along the runs of a scale, as judged on dev.
+In place of a file, `kept SCALE` is the table of the policies kept along the runs of a scale, as judged on dev, and
+`generalization SCALE` that of its arms on the terrain of training and on dev's.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ KEPT = {
     "sr_120_all": "SR@120", "sr_120_same": "same level", "sr_120_cross": "cross level",
 }  # fmt: skip
 
+SEEN = {
+    "sr_45_all": "SR@45", "sr_45_cross": "SR@45, cross level",
+    "sr_120_all": "SR@120", "sr_120_cross": "SR@120, cross level",
+}  # fmt: skip
+
 
 class SourceError(Exception):
     """A comment names nothing that is there."""
@@ -47,8 +53,8 @@ def value(source: str) -> str:
     """
     try:
         file, *keys = shlex.split(source)
-        if file == "kept":
-            return f"\n\n{_kept(*keys)}\n\n"
+        if file in TABLES:
+            return f"\n\n{TABLES[file](*keys)}\n\n"
         path = ROOT / file
         if path.suffix == ".md":
             return f"\n\n{path.read_text('utf-8').strip()}\n\n"
@@ -96,6 +102,21 @@ def _kept(scale: str) -> str:
         rates = " | ".join(f"{float(row[key]):.1f}" for key in KEPT)
         lines.append(f"| {arm} | {seed} | {steps / 1e6:.1f} M | {rates} | {float(row['spl']):.3f} |")
     return "\n".join(lines)
+
+
+def _generalization(scale: str) -> str:
+    lines = ["| arm | seed | tiles | " + " | ".join(SEEN.values()) + " |", "|---" * (len(SEEN) + 3) + "|"]
+    for path in sorted((ROOT / "results" / scale).glob("*/seed-*/generalization.json")):
+        seen, unseen = json.loads(path.read_text("utf-8"))
+        shown = " | ".join(f"{seen[rate]:.1f}, {unseen[rate]:.1f}" for rate in SEEN)
+        arm, seed = path.parts[-3], path.parts[-2].removeprefix("seed-")
+        lines.append(f"| {arm} | {seed} | {seen['tiles']} | {shown} |")
+    if not lines[2:]:
+        raise KeyError(f"no arm was held against the terrain of its training at {scale}")
+    return "\n".join(lines)
+
+
+TABLES = {"kept": _kept, "generalization": _generalization}
 
 
 def written(text: str) -> str:
