@@ -29,7 +29,16 @@ KEPT_COLUMNS = {
     "sr_120_storey": "storeys",
     "spl": "SPL",
 }
-SEEN_COLUMNS = {"arm": "arm", "terrain": "terrain", "tiles": "tiles", **dict(list(KEPT_COLUMNS.items())[2:])}
+SEEN_COLUMNS = {
+    "arm": "arm",
+    "terrain": "terrain",
+    "tiles": "tiles",
+    "sr_45_all": "SR@45",
+    "sr_45_cross": "cross",
+    "sr_120_all": "SR@120",
+    "sr_120_cross": "cross",
+    "spl": "SPL",
+}
 RESULT_COLUMNS = {
     "arm": "arm",
     "seed": "seed",
