@@ -153,7 +153,7 @@ def evaluate(
         for policy in (above for above in stage.upstream if (above.kind, above.arm) == ("policy", driver)):
             require(policy, stage)
     job.make(stages, forced=[stage for stage in stages if joints and not (stage.folder / POSTURES).exists()])
-    collected = _collect(job, {str(stage.arm) for stage in stages})
+    collected = _collect(job, [(str(stage.arm), stage.seed or 0) for stage in stages])
     chosen = names or [run["arm"] for run in collected["arms"]]
     pairs = [(names[0], other) for other in names[1:]] if names else job.project.comparisons(chosen)
     _print_results(collected, chosen, _pairs(chosen, pairs, all_pairs) if paired else [], verbose)
@@ -262,10 +262,10 @@ def _test_navigation(job: DeviceJob) -> None:
     print_table("Locomotion under navigation, shares of episodes", rows, NAVIGATION_COLUMNS)
 
 
-def _collect(at: AtScale, names: Collection[str] | None = None) -> dict[str, Any]:
+def _collect(at: AtScale, runs: Collection[tuple[str, int]] | None = None) -> dict[str, Any]:
     from romnav.report.paired.results import collect
 
-    return collect(at.project.results, at.work.scale, names)
+    return collect(at.project.results, at.work.scale, runs)
 
 
 def _pairs(arms: list[str], compared: list[tuple[str, str]], all_pairs: bool) -> list[tuple[str, str]]:

@@ -46,10 +46,12 @@ def write(work: Workspace, arms: Sequence[str], path: Path) -> list[str]:
 
 def _paired(work: Workspace, notes: list[str]) -> list[Table]:
     try:
-        return tables.evaluated(work)
+        if found := tables.evaluated(work):
+            return found
+        notes.append("no tables of episodes: no two arms of an experiment have been evaluated; see `romnav list`")
     except RomnavError as error:
         notes.append(f"no tables of episodes: {error}")
-        return []
+    return []
 
 
 def _trials(work: Workspace) -> list[Table]:

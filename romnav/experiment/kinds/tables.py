@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -63,9 +64,9 @@ def _write(
     from romnav.report import formats
     from romnav.report.paired import results, tables
 
-    shown = {str(above.arm) for above in stage.upstream}
+    shown = [(str(above.arm), above.seed or 0) for above in stage.upstream]
     arms, published = results.load(work.project.results, work.scale, shown), work.project.published(name)
-    bootstrap = Bootstrap(arms, outside=_outside([declared]))
+    bootstrap = Bootstrap(arms, outside=_outside(declared))
     built = []
     for table, spec in declared.tables.items():
         built.append(tables.build(table, spec, declared.title, bootstrap, published))
@@ -75,9 +76,9 @@ def _write(
     return {}
 
 
-def _outside(declared: Iterable[Declared]) -> list[str]:
+def _outside(declared: Declared) -> list[str]:
     """Metrics from outside in the columns of tables."""
-    columns = (c for d in declared for table in d.tables.values() for c in table.columns)
+    columns = (c for table in declared.tables.values() for c in table.columns)
     return list(dict.fromkeys(c.outside for c in columns if c.outside))
 
 
@@ -85,16 +86,19 @@ def evaluated(work: Workspace) -> list[Table]:
     """Every declared table of which at least two arms were evaluated.
 
     Raises:
-        RomnavError: None was, or rows are unreadable or cannot be compared.
+        RomnavError: Rows are unreadable or cannot be compared.
     """
     from romnav.evaluation.paired.statistics import Bootstrap
     from romnav.report.paired import results, tables
 
-    every = {name: experiment.declared(name, PAIRED) for name, experiment in work.project.experiments.items()}
-    bootstrap = Bootstrap(results.load(work.project.results, work.scale), outside=_outside(every.values()))
     built = []
-    for name, declared in every.items():
-        published = work.project.published(name)
+    for name, experiment in work.project.experiments.items():
+        declared, published = experiment.declared(name, PAIRED), work.project.published(name)
+        runs = [*itertools.product(experiment.arms, experiment.seeds), *((arm, 0) for arm in SCRIPTED)]
+        try:
+            bootstrap = Bootstrap(results.load(work.project.results, work.scale, runs), outside=_outside(declared))
+        except NothingRecorded:
+            continue
         for table, spec in declared.tables.items():
             if len(tables.evaluated(spec, bootstrap)) < 2:
                 continue

@@ -15,18 +15,22 @@ from romnav.evaluation.paired.statistics import Bootstrap
 ROWS_FILE = "episodes.parquet"
 
 
-def load(results_dir: Path, scale: str, arms: Collection[str] | None = None) -> list[rows.Arm]:
-    """Reads the rows of ``arms``, or of all of a scale: ``<results_dir>/<scale>/<arm>/seed-<n>/episodes.parquet``.
+Run = tuple[str, int]
+"""An arm and one of its training seeds."""
+
+
+def load(results_dir: Path, scale: str, runs: Collection[Run] | None = None) -> list[rows.Arm]:
+    """Reads the rows of ``runs``, or of all of a scale: ``<results_dir>/<scale>/<arm>/seed-<n>/episodes.parquet``.
 
     Raises:
         RomnavError: There are none, one is unreadable, or they cannot be compared.
     """
     folder = results_dir / scale
-    found = sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
     files = [
         file
-        for file in found
-        if file.parts[-2].removeprefix("seed-").isdecimal() and (arms is None or file.parts[-3] in arms)
+        for file in sorted(folder.glob(f"*/seed-*/{ROWS_FILE}"))
+        if (seed := file.parts[-2].removeprefix("seed-")).isdecimal()
+        and (runs is None or (file.parts[-3], int(seed)) in runs)
     ]
     if not files:
         raise NothingRecorded(
@@ -43,17 +47,17 @@ def _read_in_place(file: Path, scale: str) -> rows.EpisodeRows:
     return run
 
 
-def collect(results_dir: Path, scale: str, names: Collection[str] | None = None) -> dict[str, Any]:
+def collect(results_dir: Path, scale: str, runs: Collection[Run] | None = None) -> dict[str, Any]:
     """What ``romnav results --json`` prints: metrics per arm and training seed, contrasts per ordered pair.
 
-    Of the arms ``names`` alone, if they are given: rows of others, be they stale, do not matter then.
+    Of ``runs`` alone, if they are given: rows of others, be they stale, do not matter then.
 
     Rates and differences are in percent, times in s, training in environment steps and hours; a value that
     does not exist (time to goal without a success) is None. Contrasts pool the training seeds of an arm; their interval
     is over episodes, and over tiles (tile_lo, tile_hi), whose episodes are alike; a_only and b_only count the episodes
     that one of two runs solves, mid_p is McNemar's.
     """
-    arms = load(results_dir, scale, names)
+    arms = load(results_dir, scale, runs)
     bootstrap, by_tile = Bootstrap(arms), Bootstrap(arms, cluster="tile")
     return {
         "scale": scale,

@@ -54,6 +54,13 @@ def test_values_are_those_of_the_rows(folder: Path) -> None:
             assert c["n"] == 64
 
 
+def test_runs_that_were_not_asked_for_are_not_read(folder: Path) -> None:
+    (folder / "smoke" / "rom" / "seed-0" / "episodes.parquet").write_text("torn")
+    found = results.collect(folder, "smoke", [("rom", 1), ("uniform", 0)])
+    assert [(arm["arm"], arm["seed"]) for arm in found["arms"]] == [("rom", 1), ("uniform", 0)]
+    assert found["contrasts"][0]["a_only"] is not None
+
+
 def test_what_does_not_exist_is_none(folder: Path, episode_rows) -> None:
     rows.write(folder / "smoke" / "never" / "seed-0" / "episodes.parquet", episode_rows("never", 0.0))
     never = results.collect(folder, "smoke")["arms"][0]
