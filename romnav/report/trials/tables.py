@@ -37,8 +37,9 @@ def safety(
         for scene in scenes:
             for filtered, arm in ARMS.items():
                 few, all_ = summarise(run, scene.name, filtered, SHARED), summarise(run, scene.name, filtered)
-                rows.append(Row(f"{scene.label}, {arm}", (*_counts(few), *_rates(all_)), _rows(run, "safety")))
-            differences = (*_dashes(3), *_differences(run, scene.name), *_dashes(1))
+                cells = (*_counts(few), *_rates(all_), _share(all_.falls, all_.n))
+                rows.append(Row(f"{scene.label}, {arm}", cells, _rows(run, "safety")))
+            differences = (*_dashes(3), *_differences(run, scene.name), *_dashes(2))
             rows.append(Row(f"{scene.label}, CBF − no CBF", differences, _rows(run, "safety")))
         blocks.append(Block("ours", _title(run, labels), tuple(rows)))
     if published and published.safety:
@@ -49,7 +50,7 @@ def safety(
                 if p is None:
                     continue
                 cells = (_of(p.successes, SHARED), _of(p.collisions, SHARED), _time(p.time, p.time_std, 1))
-                rows.append(Row(f"{scene.label}, {arm}", (*cells, *_dashes(3))))
+                rows.append(Row(f"{scene.label}, {arm}", (*cells, *_dashes(4))))
         blocks.append(Block("paper", f"{published.title} (hardware)", tuple(rows)))
     held = "; ".join(
         f"{_name(run, labels)} "
@@ -59,8 +60,9 @@ def safety(
     trials = len(runs[0].of(scenes[0].name, False)["trial"])
     caption = (
         "Poisson safety filter (CBF) off and on with three sets of obstacles. Starts and goals are shared by all rows. "
-        "Collision: trials in which the body, a cylinder of 0.26 m, touches a solid. Time to goal is mean ± standard "
-        f"deviation over successes. The first {SHARED} trials are shown as in the paper, and all {trials} in percent "
+        "Collision: trials in which the body, a cylinder of 0.26 m or the humanoid's, touches a solid; fell: trials "
+        "that a fall of the humanoid ended (the cylinder cannot fall). Time to goal is mean ± standard deviation over "
+        f"successes. The first {SHARED} trials are shown as in the paper, and all {trials} in percent "
         "with 95% Wilson intervals; differences are paired, with 95% bootstrap intervals († excludes zero). "
         "Trials that end with the filter holding the robot, and those of them that it solves untouched without it: "
         f"{held}."
@@ -69,13 +71,13 @@ def safety(
     return Table(
         name="safety",
         caption=f"{caption} {note}",
-        spans=((f"{SHARED} trials", 3), (f"{trials} trials", 3)),
+        spans=((f"{SHARED} trials", 3), (f"{trials} trials", 4)),
         header=(
             "Obstacles, filter",
             *("Success", "Collision", "Time (s)"),
-            *("Success (%)", "Collision (%)", "Time (s)"),
+            *("Success (%)", "Collision (%)", "Time (s)", "Fell (%)"),
         ),
-        columns=("success_10", "collision_10", "time_10", "success", "collision", "time"),
+        columns=("success_10", "collision_10", "time_10", "success", "collision", "time", "fell"),
         blocks=tuple(blocks),
         provenance=provenance,
     )

@@ -3,8 +3,10 @@ from __future__ import annotations
 import csv
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from romnav.evaluation.trials.statistics import closed_routes, summarise
@@ -52,6 +54,14 @@ def test_safety_shows_ten_trials_as_the_paper_and_all_with_intervals(trial_run, 
     assert f"RoM {held} and {closed};" in table.caption
 
 
+def test_safety_counts_the_trials_that_a_fall_ended(trial_run, scenes) -> None:
+    run = trial_run("rom", n=64)
+    columns = {**run.columns, "outcome": np.where(run.columns["trial"] % 4 == 0, "fall", run.columns["outcome"])}
+    table = trial_tables.safety([replace(run, columns=columns)], scenes, LABELS)
+    fell = [row.cells[table.columns.index("fell")].text for row in table.blocks[0].rows]
+    assert fell[:3] == ["25.0", "25.0", "–"]
+
+
 def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run, paper) -> None:
     scenes = deployment_scenes()
     run = trial_run("rom", n=16, scenes=[scene.name for scene in scenes])
@@ -70,7 +80,7 @@ def test_all_formats_hold_the_numbers(trial_run, scenes) -> None:
     text = formats.latex(table)
     assert r"$\pm$" in text
     assert "±" not in text
-    assert all(line.count("&") == 6 for line in text.splitlines() if re.match(r"(In|Out|Adv).*\\\\$", line))
+    assert all(line.count("&") == 7 for line in text.splitlines() if re.match(r"(In|Out|Adv).*\\\\$", line))
     rows = list(csv.DictReader(io.StringIO(formats.to_csv(table))))
     paired = [r for r in rows if "−" in r["row"] and r["column"] == "collision"]
     assert len(paired) == 3
