@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,12 +12,13 @@ from romnav.navigation.observations import rotate
 from romnav.navigation.perception import viewpoint
 from romnav.navigation.spec import EnvSpec
 from romnav.robot.arms import OwnArms
-from romnav.robot.dynamics import Dynamics
+from romnav.robot.dynamics import Body, Dynamics
 from romnav.robot.spec import RobotSpec
 from romnav.safety.barrier import Filtered
 from romnav.safety.filter import SafetyFilter
 from romnav.sensing.corruption import Corruption
 from romnav.sensing.lidar import Lidar
+from romnav.world.spawns import Start
 from romnav.world.world import World
 
 
@@ -59,7 +62,58 @@ class Shield:
         self._pose = pose
         return self._filter(points.flatten(1, 2), velocity, (ranges > 0).flatten(1), motion)
 
+    def reset(self, robots: Tensor) -> None:
+        """Forget what the robots ``robots`` (K,) have seen: they are somewhere else."""
+        moved = torch.zeros(len(self._pose), dtype=torch.bool, device=self._pose.device)
+        moved[robots] = True
+        self._filter.reset(moved)
+        self._pose[robots] = torch.nan
+
     def select(self, keep: Tensor) -> None:
         """Keep only the robots ``keep`` (K,)."""
         self._filter.select(keep)
         self._pose = self._pose[keep]
+
+
+class Guarded:
+    """Robots that `body` makes behind the safety filter: they follow what it lets through of a command.
+
+    Whoever drives them knows its own commands, not the filtered ones. Sensor noise is named by robot and step.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        spec: TrialSpec,
+        env: EnvSpec,
+        robot: RobotSpec | None,
+        world: World,
+        robots: int,
+        period: float,
+    ) -> None:
+        """Arguments as of `Shield`; ``robots`` in ``world``, commanded every ``period`` s."""
+        self._robot: Dynamics = body(world, robots, period)
+        self._shield = Shield(world, robots, spec, env, robot)
+        self._noise = torch.arange(robots, device=self._robot.position.device)
+        self._step = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._robot, name)
+
+    def reset(self, envs: Tensor, start: Start) -> None:
+        """Put the robots ``envs`` (K,) at their starts."""
+        self._robot.reset(envs, start)
+        self._shield.reset(envs)
+
+    def select(self, envs: Tensor) -> None:
+        """Keep only the robots ``envs`` (K,), in that order."""
+        self._robot.select(envs)
+        self._shield.select(envs)
+        self._noise = self._noise[envs]
+
+    def step(self, command: Tensor) -> None:
+        """Track what the filter leaves of the command (E, 3) for one period."""
+        self._step += 1
+        every = torch.arange(len(command), device=command.device)
+        safe = self._shield(self._robot, every, command[:, :2], self._noise, self._step)
+        self._robot.step(torch.cat([safe.velocity, command[:, 2:]], dim=1))

@@ -132,6 +132,14 @@ class Project:
         driver = self.driver(arm)
         return driver if driver in SCRIPTED else self.having(driver)[1].arms[driver].driver
 
+    def filtered(self, arm: str) -> bool:
+        """Whether the safety filter guards the robots of an arm.
+
+        Raises:
+            RomnavError: There is no such arm.
+        """
+        return arm not in SCRIPTED and self.having(arm)[1].arms[arm].filter
+
     def seeds(self, arm: str) -> tuple[int, ...]:
         """Training seeds of an arm; a scripted one has only seed 0."""
         return (0,) if self.script(arm) else self.having(arm)[1].seeds

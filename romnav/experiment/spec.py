@@ -37,6 +37,9 @@ class Arm(Config, extra="allow"):
     """Arm whose policy, trained or scripted, it drives in place of one of its own: on another body, say."""
     driver: Annotated[str, DRIVERS] | None = Field(default=None, exclude_if=lambda driver: driver is None)
     """Scripted driver from outside that it has in place of a policy, e.g. "pkg.mod:Name"."""
+    filter: bool = Field(default=False, exclude_if=lambda filter_: not filter_)
+    """Whether the safety filter stands between what drives it and its robots, in evaluation; the arm has no policy of
+    its own then."""
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -137,6 +140,8 @@ class Experiment(Config):
                 raise ValueError(
                     f"{name} {what}, so it can only change navigation.{' and navigation.'.join(sorted(BODY))}"
                 )
+            if arm.trained and arm.filter:
+                raise ValueError(f'{name}.filter: policies are trained without it; give another arm policy = "{name}"')
             if arm.policy and arm.driver:
                 raise ValueError(f"{name} has both a policy and a driver; leave one of them out")
         return arms
@@ -210,7 +215,8 @@ def _fault(
             return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
         for first, other in before.items():
             same = other.arms.get(arm_name)
-            if same and (same.changes, same.driver, other.scales) != (arm.changes, arm.driver, experiment.scales):
+            unlike = same and same.model_dump(exclude={"label"}) != arm.model_dump(exclude={"label"})
+            if same and (unlike or other.scales != experiment.scales):
                 return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
     return None
 

@@ -128,8 +128,19 @@ def test_an_arm_of_two_experiments_is_the_same_arm(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(EXPERIMENT)
     (tmp_path / "b.toml").write_text(EXPERIMENT.replace('"Slow"', '"Slower label"'))
     assert set(load_experiments(tmp_path)[0]) == {"a", "b"}
-    (tmp_path / "b.toml").write_text(EXPERIMENT.replace("0.5", "0.6"))
-    assert "b.toml: arms.slow: a.toml has another arm of this name; rename one" in fault(tmp_path, "b")
+    guarded = '[arms.guarded]\nlabel = "G"\npolicy = "rom"\n'
+    for here, there in (("0.5", "0.6"), ("filter = true", ""), ('policy = "rom"', 'policy = "slow"')):
+        text = EXPERIMENT + guarded + "filter = true\n"
+        (tmp_path / "a.toml").write_text(text)
+        (tmp_path / "b.toml").write_text(text.replace(here, there))
+        arm = "slow" if here == "0.5" else "guarded"
+        assert f"b.toml: arms.{arm}: a.toml has another arm of this name; rename one" in fault(tmp_path, "b")
+
+
+def test_the_filter_guards_who_drives_the_policy_of_another(tmp_path: Path) -> None:
+    file = tmp_path / "e.toml"
+    file.write_text(EXPERIMENT.replace('label = "RoM"', 'label = "RoM"\nfilter = true'))
+    assert 'arms: rom.filter: policies are trained without it; give another arm policy = "rom"' in fault(tmp_path, "e")
 
 
 def test_suggest_lists_all_names_where_none_is_near() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ from romnav import __version__
 from romnav.evaluation.spec import EvaluationSpec, TrialSpec
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Stage
-from romnav.experiment.kinds.locomotion import walking
+from romnav.experiment.kinds.locomotion import body, walking
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import DRIVERS, SCRIPTED
@@ -20,6 +21,7 @@ from romnav.files import digest
 if TYPE_CHECKING:
     from romnav.evaluation.rollout import Driver
     from romnav.evaluation.rowfile import Provenance
+    from romnav.robot.dynamics import Body
     from romnav.world.world import World
 
 NOISE = 1
@@ -38,6 +40,8 @@ class Driven:
     """What drives, if it is no script."""
     settings: Scale
     """Of the robots."""
+    filtered: bool
+    """Whether the safety filter guards them."""
 
     @classmethod
     def by(cls, work: Workspace, arm: str, seed: int) -> Driven:
@@ -47,17 +51,19 @@ class Driven:
         settings = work.arm_settings(driver) if trained else work.settings
         if arm not in SCRIPTED and (script or driver != arm):
             settings = settings.on_body(work.arm_settings(arm).navigation)
-        return cls(work, arm, seed if trained else 0, trained, settings)
+        return cls(work, arm, seed if trained else 0, trained, settings, work.project.filtered(arm))
 
     @property
     def uses(self) -> tuple[str, ...]:
         """Settings that tell rows apart beside those of the policy."""
-        body: tuple[str, ...] = ("navigation.dynamics",)
+        robots: tuple[str, ...] = ("navigation.dynamics",)
         if self.settings.navigation.stair_limits is not None:
-            body += ("navigation.stair_limits",)
+            robots += ("navigation.stair_limits",)
+        if self.filtered:
+            robots += ("safety.filter", "safety.sensor", "safety.corruption")
         if self.policy is None:
-            return (*body, "navigation.env")
-        return body if self.policy.arm != self.arm else ()
+            return (*robots, "navigation.env")
+        return robots if self.policy.arm != self.arm else ()
 
     @property
     def code(self) -> tuple[str, ...]:
@@ -76,6 +82,17 @@ class Driven:
     def folder(self) -> Path:
         """Where the rows lie."""
         return self.work.folder / self.arm / f"seed-{self.seed}"
+
+    def body(self, device: str) -> Body:
+        """What makes the robots, behind the safety filter if it guards them."""
+        settings = self.settings
+        made = body(self.work, settings, self.seed, device, settings.evaluation.threads)
+        if not self.filtered:
+            return made
+        from romnav.evaluation.shield import Guarded
+
+        arms = settings.locomotion.robot if settings.navigation.dynamics == "g1" else None
+        return partial(Guarded, made, settings.safety, settings.navigation.env, arms)
 
     def driver(self, world: World, device: str) -> Driver:
         """What commands the robots."""

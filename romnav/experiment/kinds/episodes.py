@@ -12,7 +12,6 @@ from romnav.evaluation.spec import ROWS_VERSION
 from romnav.experiment.graph.run import missing
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
-from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
@@ -87,10 +86,10 @@ def _evaluate(driven: Driven, joints: bool, stage: Stage, session: Session, prog
     work, settings, path = driven.work, driven.settings, paired_set(driven.work)
     paired = load(path)
     world = terrain(paired, path, work.project.worlds).to(session.device)
-    robots = body(work, settings, driven.seed, session.device, settings.evaluation.threads)
     driver = driven.driver(world, session.device)
     recorder = postures.PostureRecorder() if joints else tracks.Recorder()
-    measured = run(driver, world, paired, settings.navigation.env, settings.evaluation, progress, robots, recorder)
+    env, spec, robots = settings.navigation.env, settings.evaluation, driven.body(session.device)
+    measured = run(driver, world, paired, env, spec, progress, robots, recorder)
     count = len(paired)
     columns: dict[str, Any] = {
         "arm": [driven.arm] * count,

@@ -12,7 +12,6 @@ from romnav.evaluation.spec import EpisodeSetSpec
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.kept import EPISODES
-from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -63,8 +62,9 @@ def _compare(driven: Driven, stage: Stage, session: Session, progress: Progress)
         ("unseen", unseen, terrain(unseen, path, work.project.worlds)),
     ):
         here, env = world.to(session.device), settings.navigation.env
-        robots = body(work, settings, driven.seed, session.device, spec.threads)
-        found = along.judge(driven.driver(here, session.device), here, episodes, env, spec, progress, robots)
+        found = along.judge(
+            driven.driver(here, session.device), here, episodes, env, spec, progress, driven.body(session.device)
+        )
         rows.append({"terrain": name, "tiles": len(world.tiles), **found})
     files.write(stage.folder / stage.outputs[0], json.dumps(rows, indent=2) + "\n")
     return {}

@@ -11,7 +11,7 @@ from typing import Any
 from romnav import files
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
-from romnav.experiment.kinds.locomotion import body, locomotion
+from romnav.experiment.kinds.locomotion import locomotion
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -55,7 +55,7 @@ def _count(drivers: list[Driven], stage: Stage, session: Session, progress: Prog
     rows: list[dict[str, Any]] = []
     for driven in drivers:
         env, spec = driven.settings.navigation.env, driven.settings.evaluation
-        robots = body(work, driven.settings, 0, session.device, spec.threads)
-        rows += count(driven.arm, driven.driver(world, session.device), world, dev, env, spec, robots, progress)
+        driver, robots = driven.driver(world, session.device), driven.body(session.device)
+        rows += count(driven.arm, driver, world, dev, env, spec, robots, progress)
     files.write(stage.folder / stage.outputs[0], json.dumps(rows, indent=2) + "\n")
     return {}

@@ -13,7 +13,6 @@ from romnav.errors import RomnavError
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.encoder import encoder
 from romnav.experiment.kinds.episodes import ground, paired_set, read_ways
-from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.workspace import Workspace
 from romnav.progress import Progress
 
@@ -91,7 +90,7 @@ class Again:
             settings.evaluation,
             tracks=tracks if postures or not walks else None,
             postures=(postures, robot) if postures else None,
-            body=body(self._driven.work, settings, self._driven.seed, "cpu", settings.evaluation.threads),
+            body=self._driven.body("cpu"),
             critic=self._critic,
             shield=shield,
             progress=progress,

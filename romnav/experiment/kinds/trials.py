@@ -31,8 +31,13 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
     on that, otherwise on the reduced-order model with a body.
 
     Raises:
-        RomnavError: The arm drives the policy of another one on the same body.
+        RomnavError: The arm drives the policy of another one on the same body, or has the filter in all it does.
     """
+    if work.project.filtered(arm):
+        raise RomnavError(
+            f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.filter: trials have the filter both off and "
+            "on; leave it out"
+        )
     driver = work.project.driver(arm)
     if driver != arm and work.arm_settings(arm).navigation.dynamics == "rom":
         raise RomnavError(

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
 from romnav.evaluation.rollout import Oracle, Straight, View
-from romnav.evaluation.shield import Shield
+from romnav.evaluation.shield import Guarded, Shield
 from romnav.evaluation.spec import TrialSpec
 from romnav.evaluation.trials import run as trials
 from romnav.navigation.spec import EnvSpec
@@ -16,6 +18,7 @@ from romnav.safety.barrier import Status
 from romnav.sensing.spec import LidarSpec
 from romnav.world.scenes.obstacles import obstacle_scenes
 from romnav.world.scenes.scene import Scene, scene_world
+from romnav.world.spawns import Start
 from romnav.world.world import World
 
 SPEC = TrialSpec(trials=4, duration=25.0, sensor=LidarSpec(rows=30, columns=110))
@@ -172,3 +175,34 @@ def test_the_shield_looks_through_a_head_that_is_turned_and_ahead_of_the_feet(wo
             wanted, noise = torch.tensor([[0.3, 0.0]]), torch.tensor([0])
             for shield, robot in zip(shields, (standing, swaying), strict=True):
                 assert shield(robot, torch.tensor([1]), wanted, noise, 1).velocity[0, 0] > 0.29
+
+
+def walked(robots: BodyModel | Guarded, start: Start, rows: list[int], steps: int = 20) -> list[torch.Tensor]:
+    """Positions (steps, R, 2) of ``rows``, and whether they touched something (R,); ahead, alone after half the way."""
+    robots.reset(torch.arange(len(start.yaw)), start)
+    ways, touched = [], torch.zeros(len(rows), dtype=torch.bool)
+    for step in range(steps):
+        robots.step(torch.tensor([1.0, 0.0, 0.0]).expand(len(robots.yaw), 3))
+        if step == steps // 2:
+            robots.select(torch.tensor(rows))
+        here = slice(None) if step >= steps // 2 else rows
+        ways.append(robots.position[here, :2])
+        touched |= robots.contacts[here] > 0
+    return [torch.stack(ways), touched]
+
+
+def test_guarded_robots_stop_where_others_touch(scenes: tuple[Scene, ...], world: World) -> None:
+    """Straight at what is in the way, for as long as it takes to get there; dropping others changes nothing."""
+    episodes = trials.draw(scenes, world, SPEC)
+    start = episodes.start("cpu")
+    guarded = partial(Guarded, BodyModel, SPEC, EnvSpec(), None)
+    _, hit = walked(BodyModel(world, len(episodes), 0.2), start, [*range(12)], 60)
+    way, safe = walked(guarded(world, len(episodes), 0.2), start, [*range(12)], 60)
+    assert hit.sum() >= 4
+    assert not safe.any()
+    kept = [k for k in range(12) if hit[k]]
+    torch.testing.assert_close(walked(guarded(world, len(episodes), 0.2), start, kept, 60)[0], way[:, kept])
+    robots = guarded(world, len(episodes), 0.2)
+    walked(robots, start, [*range(12)], 60)
+    robots._step = 0  # the same noise
+    torch.testing.assert_close(walked(robots, start, [*range(12)], 60)[0], way)

@@ -102,6 +102,26 @@ def test_trials_are_repeated_where_filter_scenes_or_policy_changed(
     assert changed == rerun | ({"report safety"} if rerun else set())
 
 
+def test_rows_of_a_guarded_arm_depend_on_the_filter(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    guarded = '[arms.{name}]\nlabel = "G"\npolicy = "{policy}"\nfilter = true\n'
+    file = here.project.file("guarded")
+    file.write_text(
+        'kind = "ablation"\ntitle = "t"\n'
+        + guarded.format(name="rom-guarded", policy="rom")
+        + guarded.format(name="oracle-guarded", policy="oracle")
+    )
+    arms = ("rom", "rom-guarded", "oracle", "oracle-guarded")
+    here = Workspace(Project(tmp_path, tmp_path / "results"), here.scale)
+    before = {arm: episodes(here, arm, 0).key for arm in arms}
+    assert len({*before.values()}) == 4
+    other = workspace(tmp_path, SCALE + "[safety.filter.occupancy]\nmargin = 0.2\n")
+    changed = {arm for arm in arms if episodes(other, arm, 0).key != before[arm]}
+    assert changed == {"rom-guarded", "oracle-guarded"}
+    with pytest.raises(RomnavError, match=r"guarded\.toml: arms\.oracle-guarded\.filter: trials have the filter both"):
+        trials.trials(other, "safety", "oracle-guarded", 0)
+
+
 def test_trials_are_out_of_date_when_a_scene_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
     here = workspace(tmp_path)
