@@ -177,7 +177,7 @@ def test_the_shield_looks_through_a_head_that_is_turned_and_ahead_of_the_feet(wo
                 assert shield(robot, torch.tensor([1]), wanted, noise, 1).velocity[0, 0] > 0.29
 
 
-def walked(robots: BodyModel | Guarded, start: Start, rows: list[int], steps: int = 20) -> list[torch.Tensor]:
+def walked(robots: BodyModel | Guarded, start: Start, rows: list[int], steps: int = 60) -> list[torch.Tensor]:
     """Positions (steps, R, 2) of ``rows``, and whether they touched something (R,); ahead, alone after half the way."""
     robots.reset(torch.arange(len(start.yaw)), start)
     ways, touched = [], torch.zeros(len(rows), dtype=torch.bool)
@@ -196,13 +196,13 @@ def test_guarded_robots_stop_where_others_touch(scenes: tuple[Scene, ...], world
     episodes = trials.draw(scenes, world, SPEC)
     start = episodes.start("cpu")
     guarded = partial(Guarded, BodyModel, SPEC, EnvSpec(), None)
-    _, hit = walked(BodyModel(world, len(episodes), 0.2), start, [*range(12)], 60)
-    way, safe = walked(guarded(world, len(episodes), 0.2), start, [*range(12)], 60)
+    _, hit = walked(BodyModel(world, len(episodes), 0.2), start, [*range(12)])
+    way, safe = walked(guarded(world, len(episodes), 0.2), start, [*range(12)])
     assert hit.sum() >= 4
     assert not safe.any()
     kept = [k for k in range(12) if hit[k]]
-    torch.testing.assert_close(walked(guarded(world, len(episodes), 0.2), start, kept, 60)[0], way[:, kept])
+    torch.testing.assert_close(walked(guarded(world, len(episodes), 0.2), start, kept)[0], way[:, kept])
     robots = guarded(world, len(episodes), 0.2)
-    walked(robots, start, [*range(12)], 60)
+    walked(robots, start, [*range(12)])
     robots._step = 0  # the same noise
-    torch.testing.assert_close(walked(robots, start, [*range(12)], 60)[0], way)
+    torch.testing.assert_close(walked(robots, start, [*range(12)])[0], way)
