@@ -2,9 +2,10 @@
 
 The paper rasterises the cloud "after removing the ground" (Sec. "Poisson Safety Filter"). On slopes, stairs
 and landings no plane is the ground, so it is grown here from under the robot's feet over a coarse height map:
-a neighbouring cell belongs to it if its lowest return is within a step, give or take a slope, of it. What is
-not ground in that sense (a table top, the storey below a railing) inherits the ground next to it; a return is
-an obstacle if it lies more than a step above the ground of its cell and lower than the robot's height.
+a neighbouring cell belongs to it if its lowest return is within a step, give or take a slope, of it. What no way
+leads to by such steps (a table top, the storey below a railing) inherits the ground next to it. A return is an
+obstacle if it lies more than a step above the ground of its cell and lower than the robot's height; at the edge of a
+ledge, such as a flight of stairs seen from beside it, the ground below counts as well.
 
 What has left the field of view is remembered if the caller tells how the robot has moved: one return of each cell,
 carried along at its own place rather than its cell's, so that nothing is rounded twice. It is forgotten after a while;
@@ -73,42 +74,65 @@ def _grow(
     gap: wp.array3d(dtype=float),
     ground: wp.array3d(dtype=float),
 ):
-    """Ground height of every cell, breadth first from the robot's feet at height zero.
+    """Ground height of every cell, from the robot's feet at height zero, and its way to ground that was seen, m.
 
-    The tolerance is a step, and the steepest rise over the way from the last cell that was seen to be ground.
+    The tolerance is a step, and the steepest rise over that way. Ground that was seen is followed to its end before a
+    gap is crossed, so that gaps are crossed where they are narrow, and all that can be climbed to before the rest
+    inherits: treads are reached from the foot of their flight, not from beside it.
     """
     b = wp.tid()
     n = lowest.shape[1]
     centre = n // 2
     ground[b, centre, centre] = 0.0
     gap[b, centre, centre] = 0.0
-    queue[b, 0] = centre * n + centre
-    head = wp.int32(0)
-    tail = wp.int32(1)
-    while head < tail:
-        here = queue[b, head]
-        head += 1
-        i = here // n
-        j = here % n
-        z = ground[b, i, j]
-        unseen = gap[b, i, j]
-        for k in range(9):
-            ni = i + k // 3 - 1
-            nj = j + k % 3 - 1
-            if ni >= 0 and nj >= 0 and ni < n and nj < n and gap[b, ni, nj] < 0.0:
-                low = lowest[b, ni, nj]
-                away = unseen + cell * wp.length(wp.vec2(float(ni - i), float(nj - j)))
-                if low == _UNSEEN:
-                    ground[b, ni, nj] = z
-                    gap[b, ni, nj] = away
-                elif wp.abs(low - z) <= step + slope * away:
-                    ground[b, ni, nj] = low
-                    gap[b, ni, nj] = 0.0
-                else:
-                    ground[b, ni, nj] = z
-                    gap[b, ni, nj] = unseen
-                queue[b, tail] = ni * n + nj
+    for climbs in range(2):
+        head = wp.int32(0)
+        tail = wp.int32(0)
+        top = n * n  # a stack from the queue's other end: ground that was seen
+        for here in range(n * n):
+            if gap[b, here // n, here % n] >= 0.0:
+                queue[b, tail] = here
                 tail += 1
+        while head < tail or top < n * n:
+            if top < n * n:
+                here = queue[b, top]
+                top += 1
+            else:
+                here = queue[b, head]
+                head += 1
+            z = ground[b, here // n, here % n]
+            unseen = gap[b, here // n, here % n]
+            for k in range(9):
+                i = here // n + k // 3 - 1
+                j = here % n + k % 3 - 1
+                if _holds(wp.vec2i(i, j), n, n) and gap[b, i, j] < 0.0:
+                    low = lowest[b, i, j]
+                    away = unseen + cell * wp.length(wp.vec2(float(k // 3 - 1), float(k % 3 - 1)))
+                    if low != _UNSEEN and wp.abs(low - z) <= step + slope * away:
+                        ground[b, i, j] = low
+                        gap[b, i, j] = 0.0
+                        top -= 1
+                        queue[b, top] = i * n + j
+                    elif low == _UNSEEN or climbs == 1:
+                        ground[b, i, j] = z
+                        gap[b, i, j] = wp.where(low == _UNSEEN, away, unseen)
+                        queue[b, tail] = i * n + j
+                        tail += 1
+
+
+@wp.kernel(enable_backward=False)
+def _ledges(ground: wp.array3d(dtype=float), gap: wp.array3d(dtype=float), step: float, below: wp.array3d(dtype=float)):
+    """The lowest ground seen beside a cell that lies more than a step below its own, which is then a ledge's edge."""
+    b, i, j = wp.tid()
+    z = ground[b, i, j]
+    lowest = z
+    for k in range(9):
+        at = wp.vec2i(i + k // 3 - 1, j + k % 3 - 1)
+        if _holds(at, ground.shape[1], ground.shape[2]) and gap[b, at[0], at[1]] == 0.0:
+            other = ground[b, at[0], at[1]]
+            if z - other > step:
+                lowest = wp.min(lowest, other)
+    below[b, i, j] = lowest
 
 
 # A remembered return: its age in sixteenths of a call (18 bits), how far it lies below `_TOP` (12), and its place (16
@@ -186,6 +210,7 @@ def _mark(
     points: wp.array2d(dtype=wp.vec3),
     valid: wp.array2d(dtype=wp.bool),
     ground: wp.array3d(dtype=float),
+    below: wp.array3d(dtype=float),
     half: float,
     cell: float,
     step: float,
@@ -199,8 +224,11 @@ def _mark(
     at = _cell_of(p, half, cell)
     if not _holds(at, memory.shape[1], memory.shape[2]):
         return
-    above = p[2] - ground[b, at[0] // _GROUND_CELLS, at[1] // _GROUND_CELLS]
-    if above > step and above <= height:
+    i = at[0] // _GROUND_CELLS
+    j = at[1] // _GROUND_CELLS
+    above = p[2] - ground[b, i, j]
+    edge = p[2] - below[b, i, j]
+    if (above > step and above <= height) or (edge > step and edge <= height):
         _remember(p, wp.int64(0), half, cell, b, memory)
 
 
@@ -381,6 +409,14 @@ class Rasterizer:
             outputs=[wp.from_torch(self._gap), surface],
             device=device,
         )
+        # the lowest returns are used up
+        wp.launch(
+            _ledges,
+            dim=self._lowest.shape,
+            inputs=[surface, wp.from_torch(self._gap), spec.step],
+            outputs=[lowest],
+            device=device,
+        )
         if motion is not None:
             motion = motion.float().contiguous()
             wp.launch(
@@ -403,7 +439,7 @@ class Rasterizer:
         wp.launch(
             _mark,
             dim=cloud.shape,
-            inputs=[cloud, mask, surface, half, spec.cell, spec.step, spec.height],
+            inputs=[cloud, mask, surface, lowest, half, spec.cell, spec.step, spec.height],
             outputs=[memory],
             device=device,
         )

@@ -127,6 +127,32 @@ def test_walls_railings_and_tables():
     assert all(near(top, x, y) for x in (1.45, 1.9, 2.4) for y in (-0.5, 0.0, 0.5))
 
 
+def flight_beside(foot: float = 0.0) -> list[np.ndarray]:
+    """A floor and a flight that rises to the left at 1.5 m ahead, 1.2 m wide, its foot in view."""
+    floor = patch((-3, 3), (-3, 3), flat)
+    treads = patch((1.5, 2.7), (foot, 2.4), flat)
+    treads[:, 2] = 0.17 * (np.floor((treads[:, 1] - foot) / 0.28) + 1)
+    under = (floor[:, 0] > 1.45) & (floor[:, 0] < 2.7) & (floor[:, 1] > foot)
+    side = wall((1.5, 1.5), (foot, 2.4), (0.0, 1.6), 0.02)
+    side = side[side[:, 2] < 0.17 * (np.floor((side[:, 1] - foot) / 0.28) + 1)]
+    return [floor[~under], treads, side]
+
+
+def test_a_flight_beside_the_robot_has_an_edge_and_free_treads():
+    grid = rasterise(*flight_beside(), noise=0.01).occupied
+    assert all(near(grid, 1.55, y) for y in np.linspace(0.5, 2.3, 10))
+    assert not any(near(grid, 2.1, y, 0.35) for y in np.linspace(-1.0, 2.0, 12))
+
+
+def test_a_railing_above_lower_treads_is_an_obstacle():
+    """Measured from the treads it would be higher than the robot; from the landing on which it stands, it is not."""
+    landing, lower = patch((-3, 1.5), (-3, 3), flat), patch((1.5, 3), (-3, 3), flat)
+    lower[:, 2] = -0.17 * (np.floor((lower[:, 1] + 3) / 0.28) + 1)  # down to the left from the landing's height
+    rail = wall((1.45, 1.45), (-2.5, 2.5), (0.98, 1.02), 0.02)
+    grid = rasterise(landing, lower, rail, noise=0.01).occupied
+    assert all(near(grid, 1.45, y) for y in np.linspace(-2.4, 2.4, 13))
+
+
 def test_poles_on_stairs_and_on_the_landing():
     for x, z in ((1.9, 0.45), (2.8, 1.0)):
         pole = wall((x, x + 0.02), (-0.4, -0.38), (z + 0.05, z + 1.2))
