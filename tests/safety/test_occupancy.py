@@ -144,6 +144,15 @@ def test_a_flight_beside_the_robot_has_an_edge_and_free_treads():
     assert not any(near(grid, 2.1, y, 0.35) for y in np.linspace(-1.0, 2.0, 12))
 
 
+def test_a_stepladder_is_no_flight():
+    """Rungs 0.3 m apart, one above the other's edge, over a floor that is seen between them."""
+    rungs = [
+        patch((1.5 + 0.083 * k, 1.58 + 0.083 * k), (-0.24, 0.24), lambda x, k=k: 0.3 * k + 0 * x) for k in range(1, 6)
+    ]
+    grid = rasterise(*TERRAIN["flat"], *rungs, noise=0.01).occupied
+    assert all(near(grid, x, y, 0.06) for x in (1.7, 1.8, 1.9) for y in np.linspace(-0.2, 0.2, 5))
+
+
 def test_a_railing_above_lower_treads_is_an_obstacle():
     """Measured from the treads it would be higher than the robot; from the landing on which it stands, it is not."""
     landing, lower = patch((-3, 1.5), (-3, 3), flat), patch((1.5, 3), (-3, 3), flat)
