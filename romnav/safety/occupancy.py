@@ -121,8 +121,8 @@ def _grow(
 
 
 @wp.kernel(enable_backward=False)
-def _ledges(ground: wp.array3d(dtype=float), gap: wp.array3d(dtype=float), step: float, below: wp.array3d(dtype=float)):
-    """The lowest ground seen beside a cell that lies more than a step below its own, which is then a ledge's edge."""
+def _ledges(ground: wp.array3d(dtype=float), gap: wp.array3d(dtype=float), drop: float, below: wp.array3d(dtype=float)):
+    """The lowest ground seen beside a cell that lies more than ``drop`` below its own, which is then a ledge's edge."""
     b, i, j = wp.tid()
     z = ground[b, i, j]
     lowest = z
@@ -130,7 +130,7 @@ def _ledges(ground: wp.array3d(dtype=float), gap: wp.array3d(dtype=float), step:
         at = wp.vec2i(i + k // 3 - 1, j + k % 3 - 1)
         if _holds(at, ground.shape[1], ground.shape[2]) and gap[b, at[0], at[1]] == 0.0:
             other = ground[b, at[0], at[1]]
-            if z - other > step:
+            if z - other > drop:
                 lowest = wp.min(lowest, other)
     below[b, i, j] = lowest
 
@@ -409,11 +409,11 @@ class Rasterizer:
             outputs=[wp.from_torch(self._gap), surface],
             device=device,
         )
-        # the lowest returns are used up
+        # from here on the lowest returns are not needed; between the far ends of two cells a stair may rise, too
         wp.launch(
             _ledges,
             dim=self._lowest.shape,
-            inputs=[surface, wp.from_torch(self._gap), spec.step],
+            inputs=[surface, wp.from_torch(self._gap), spec.step + 2.0 * coarse * spec.slope],
             outputs=[lowest],
             device=device,
         )

@@ -16,6 +16,7 @@ from romnav.robot.dynamics import Head
 from romnav.robot.rom import ReducedOrderModel
 from romnav.safety.barrier import Status
 from romnav.sensing.spec import LidarSpec
+from romnav.world.scenes.deployments import deployment_scenes
 from romnav.world.scenes.obstacles import obstacle_scenes
 from romnav.world.scenes.scene import Scene, scene_world
 from romnav.world.spawns import Start
@@ -206,3 +207,13 @@ def test_guarded_robots_stop_where_others_touch(scenes: tuple[Scene, ...], world
     walked(robots, start, [*range(12)])
     robots._step = 0  # the same noise
     torch.testing.assert_close(walked(robots, start, [*range(12)])[0], way)
+
+
+def test_the_filter_lets_pass_who_climbs_two_storeys_of_u_turns() -> None:
+    """Their flights are seen from beside, from below and between the wires of railings on the way."""
+    scenes = tuple(scene for scene in deployment_scenes() if scene.name == "stairwell")
+    drawn = trials.run(Oracle(), scenes, scene_world(scenes), EnvSpec(), TrialSpec(trials=8, duration=100.0, seed=1000))
+    on = drawn["filter"]
+    assert (drawn["outcome"][on] == "success").all()
+    assert drawn["time"][on].mean() < 1.15 * drawn["time"][~on].mean()
+    assert not drawn["collisions"][on].any()
