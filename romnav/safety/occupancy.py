@@ -85,7 +85,7 @@ def _grow(
     centre = n // 2
     ground[b, centre, centre] = 0.0
     gap[b, centre, centre] = 0.0
-    for climbs in range(2):
+    for inherits in range(2):
         head = wp.int32(0)
         tail = wp.int32(0)
         top = n * n  # a stack from the queue's other end: ground that was seen
@@ -113,7 +113,7 @@ def _grow(
                         gap[b, i, j] = 0.0
                         top -= 1
                         queue[b, top] = i * n + j
-                    elif low == _UNSEEN or climbs == 1:
+                    elif low == _UNSEEN or inherits == 1:
                         ground[b, i, j] = z
                         gap[b, i, j] = wp.where(low == _UNSEEN, away, unseen)
                         queue[b, tail] = i * n + j
