@@ -140,7 +140,9 @@ def _judge(
         name = digest(file)[:16]
         if name in rows:
             continue
-        driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
+        action = settings.navigation.action
+        actor = checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth, action=action)
+        driver = Policy(actor, seen)
         robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
         env, spec = settings.navigation.env, settings.evaluation
         saved = checkpoint.read(file)
