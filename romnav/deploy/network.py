@@ -83,7 +83,7 @@ class PortableCore(nn.Module):
 
 
 class PortablePolicy(nn.Module):
-    """Images, state and memory in; the command, by what the policy acts by, and the next memory out.
+    """Images, state and memory in; the command, by the means of the distributions, and the next memory out.
 
     Args:
         actor: The policy.
@@ -101,7 +101,7 @@ class PortablePolicy(nn.Module):
         self.attention = PortableAttention(attention) if isinstance(attention, Attention) else attention
         self.core = PortableCore(actor.core)
         self.head = actor.mlp
-        self.action = actor.act
+        self.action = actor.distribution.as_deterministic_output_module()
         self.limits = command
         self.state_size = actor.obs_dim
 

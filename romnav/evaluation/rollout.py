@@ -75,7 +75,7 @@ class View:
 
 
 class Policy:
-    """A trained policy, acting by the mean or the mode of its distributions."""
+    """A trained policy, acting by the mean of its distributions."""
 
     def __init__(self, actor: NavigationActor, perception: Perception) -> None:
         self.actor = actor

@@ -96,8 +96,8 @@ class Scale(Config):
         return self.world.model_copy(update={"tiles": self.navigation.tiles or self.world.tiles})
 
     def on_body(self, own: NavigationSpec) -> Scale:
-        """The same with robots of another body, or other actions."""
-        other = {"dynamics": own.dynamics, "stair_limits": own.stair_limits, "action": own.action}
+        """The same with robots of another body."""
+        other = {"dynamics": own.dynamics, "stair_limits": own.stair_limits}
         return self.model_copy(update={"navigation": self.navigation.model_copy(update=other)})
 
 

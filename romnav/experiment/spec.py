@@ -22,7 +22,7 @@ DRIVERS = Kind("scripted driver", "romnav.drivers", "romnav.evaluation.rollout:D
 RESERVED = {*SCRIPTED, "figures", *(file.stem for file in Path(__file__).with_name("kinds").glob("[!_]*.py"))}
 """Names of other folders beside those of the arms: figures, and one for a kind of stage."""
 
-DRIVES = {"dynamics", "stair_limits", "action"}
+BODY = {"dynamics", "stair_limits"}
 """What an arm may change of the navigation section that drives the policy of another arm."""
 
 C = TypeVar("C", bound=Config)
@@ -135,10 +135,10 @@ class Experiment(Config):
         for name, arm in arms.items():
             changed = arm.changes.get("navigation", {})
             beside = arm.changes.keys() - {"navigation"}
-            if not arm.trained and (beside or not isinstance(changed, dict) or changed.keys() - DRIVES):
+            if not arm.trained and (beside or not isinstance(changed, dict) or changed.keys() - BODY):
                 what = f"drives the policy of {arm.policy}" if arm.policy else f"is driven by {arm.driver}"
                 raise ValueError(
-                    f"{name} {what}, so it can only change navigation.{' and navigation.'.join(sorted(DRIVES))}"
+                    f"{name} {what}, so it can only change navigation.{' and navigation.'.join(sorted(BODY))}"
                 )
             if arm.trained and arm.filter:
                 raise ValueError(f'{name}.filter: policies are trained without it; give another arm policy = "{name}"')

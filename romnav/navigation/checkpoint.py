@@ -11,9 +11,9 @@ from tensordict import TensorDict
 
 from romnav import parts
 from romnav.errors import RomnavError
-from romnav.navigation.policy import BEARING, BetaMode, NavigationActor
+from romnav.navigation.policy import BEARING, NavigationActor
 from romnav.navigation.ppo import PrivilegedCritic, make_actor, make_critic
-from romnav.navigation.spec import Action, NavigationSpec
+from romnav.navigation.spec import NavigationSpec
 from romnav.sensing.encoder import Encoder
 from romnav.tensors import Kind, require_finite
 
@@ -44,17 +44,12 @@ def load_critic(path: Path) -> PrivilegedCritic | None:
 
 
 def load_actor(
-    path: Path,
-    encoder: Encoder,
-    device: str = "cpu",
-    *,
-    depth_encoder: Encoder | None = None,
-    action: Action = "mean",
+    path: Path, encoder: Encoder, device: str = "cpu", *, depth_encoder: Encoder | None = None
 ) -> NavigationActor:
     """The policy of ``path`` for the tokens of ``encoder`` and ``depth_encoder``, in evaluation mode.
 
     One that trained its encoder has a copy of ``encoder`` with its own weights. One without a depth camera needs no
-    ``depth_encoder``. Where it draws no actions, it acts by the ``action`` of its distributions.
+    ``depth_encoder``.
 
     Raises:
         RomnavError: As `read`; the policy was trained with another encoder; its weights do not fit its spec or are not
@@ -81,8 +76,6 @@ def load_actor(
         actor = make_actor(TensorDict(seen, batch_size=[1]), spec.policy, guided=spec.ppo.guidance > 0.0)
         if own:
             actor.encoder = copy.deepcopy(encoder)
-        if action == "mode":
-            actor.act = BetaMode(actor.distribution.action_range)
         actor.load_state_dict(content["actor"])
     except ValidationError as error:
         first = error.errors()[0]

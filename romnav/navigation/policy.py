@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
@@ -148,23 +148,6 @@ class Attention(nn.Module):
         return x.unflatten(2, (parts, self.heads, -1)).float()
 
 
-class BetaMode(nn.Module):
-    """The likeliest action of Beta distributions, as rsl-rl's module gives their mean.
-
-    Where the mean of one that leans on a limit stays short of it by the breadth of the distribution, the mode is at it.
-    """
-
-    def __init__(self, action_range: tuple[float, float]) -> None:
-        super().__init__()
-        self.low, self.high = action_range
-
-    def forward(self, raw: Tensor) -> Tensor:
-        """What the distribution makes its parameters of, (..., 2, 3) -> actions (..., 3)."""
-        # rsl-rl has alpha = softplus + 1: the mode is (alpha - 1) / (alpha + beta - 2)
-        alpha, beta = torch.nn.functional.softplus(raw).unbind(dim=-2)
-        return self.low + (self.high - self.low) * alpha / (alpha + beta)
-
-
 class NavigationActor(MLPModel):
     """rsl-rl actor: attention over LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
 
@@ -202,8 +185,6 @@ class NavigationActor(MLPModel):
             hidden_dims=[spec.hidden],
             distribution_cfg={"class_name": "BetaDistribution"},
         )
-        self.act: nn.Module = self.distribution.as_deterministic_output_module()
-        """What makes the action of raw parameters (..., 2, 3) where none is drawn: their mean, or `BetaMode`."""
         self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + BEARING, embedding), nn.ELU())
         self.attention = type(self).reader(tokens, channels, embedding, spec)
         self.core = RecurrentCore(seen, spec.recurrent)
@@ -222,13 +203,10 @@ class NavigationActor(MLPModel):
         hidden_state: HiddenState = None,
         stochastic_output: bool = False,
     ) -> Tensor:
-        """Actions (..., 3): samples or what `act` makes.
-
-        Products up to the last layer in `reduced_precision`; weights float32.
-        """
+        """Actions (..., 3): samples or means. Products up to the last layer in `reduced_precision`; weights float32."""
         parameters = self._raw(obs, masks, hidden_state)
         if not stochastic_output:
-            return cast(Tensor, self.act(parameters))
+            return self.distribution.deterministic_output(parameters)
         self.distribution.update(parameters)
         return self.distribution.sample()
 

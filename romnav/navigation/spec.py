@@ -250,10 +250,6 @@ class KickstartSpec(Config):
     exploration)."""
 
 
-Action = Literal["mean", "mode"]
-"""What of its distributions a policy acts by where it does not draw from them."""
-
-
 class NavigationSpec(Config):
     """Everything that the navigation stage needs beside world, sensors and encoder."""
 
@@ -263,8 +259,6 @@ class NavigationSpec(Config):
     stair_limits: tuple[Positive, Positive] | None = Field(default=None, exclude_if=lambda limits: limits is None)
     """Fastest forward command, m/s, and turn, rad/s, that the humanoid follows while its next foothold is not level
     with its feet (A: none, as in the paper)."""
-    action: Action = Field(default="mean", exclude_if=lambda action: action == "mean")
-    """What of its distributions the policy acts by once it is trained (A: means, as in rsl-rl)."""
     tiles: int | None = Field(default=None, ge=1, le=2**16, exclude_if=lambda tiles: tiles is None)
     """Number of tiles to train on where it is not ``world.tiles``, on which encoders are trained, too; of the same seed
     (A: none; a long run learns few tiles by heart)."""

@@ -12,7 +12,7 @@ from romnav.deploy import export as module
 from romnav.deploy.card import Card
 from romnav.deploy.export import TOLERANCE, export
 from romnav.errors import RomnavError
-from romnav.navigation.policy import BetaMode, NavigationActor
+from romnav.navigation.policy import NavigationActor
 from tests.deploy.conftest import DEPTH, FELT, actor, card, encoders, humanoids
 
 
@@ -42,14 +42,6 @@ def test_a_policy_of_the_reduced_order_model_is_that_of_pytorch(tmp_path: Path) 
     card_ = card()
     assert export(actor(lidar), lidar, None, card_, tmp_path / "p.onnx", lambda *_: None).error <= TOLERANCE  # type: ignore[operator]
     assert told(tmp_path / "p.onnx").inputs.keys() == {"lidar", "state", "memory"}
-
-
-def test_one_that_acts_by_modes_does_so_on_the_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`export` holds the file against the policy."""
-    monkeypatch.setattr(module, "STEPS", 8)
-    policy, lidar, depth = humanoids()
-    policy.act = BetaMode((-1.0, 1.0))
-    export(policy, lidar, depth, card(depth=DEPTH, proprioception=FELT), tmp_path / "p.onnx", lambda *_: None)
 
 
 class Forgetful(NavigationActor):

@@ -298,13 +298,9 @@ def test_the_projects_own_experiments_are_valid_at_every_scale() -> None:
     [
         ('policy = "rmo"', "arms.slow.policy: no arm rmo that is trained; did you mean rom"),
         ('policy = "slow"', "arms.slow.policy: no arm slow that is trained"),
-        ('policy = "rom"\nnavigation.ppo.gamma = 0.5', "can only change navigation.action"),
-        ('policy = "rom"\nworld.tiles = 3', "can only change navigation.action"),
-        ('policy = "rom"\nnavigation = 3', "can only change navigation.action"),
-        (
-            'policy = "rom"\nnavigation.tiles = 3',
-            "can only change navigation.action and navigation.d",
-        ),
+        ('policy = "rom"\nnavigation.ppo.gamma = 0.5', "can only change navigation.dynamics"),
+        ('policy = "rom"\nworld.tiles = 3', "can only change navigation.dynamics"),
+        ('policy = "rom"\nnavigation = 3', "can only change navigation.dynamics"),
     ],
 )
 def test_an_arm_that_drives_another_ones_policy(tmp_path: Path, change: str, message: str) -> None:

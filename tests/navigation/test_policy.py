@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from romnav.navigation.policy import Attention, BetaMode, NavigationActor, RecurrentCore
+from romnav.navigation.policy import Attention, NavigationActor, RecurrentCore
 from romnav.navigation.spec import PolicySpec
 
 SPEC = PolicySpec(attention=16, heads=2, queries=4, recurrent=16, hidden=16)
@@ -142,21 +142,6 @@ def test_actions_are_bounded_beta_samples() -> None:
         torch.tensor(2.0)
     )
     torch.testing.assert_close(policy.get_output_log_prob(samples[-1]), expected)
-
-
-def test_it_acts_by_means_or_by_the_likeliest_actions() -> None:
-    policy, obs = actor(), rollout(1, 64)
-    with torch.no_grad():  # an untrained head is all but constant
-        policy.mlp[2].weight.normal_()
-    policy.reset()
-    alpha, beta = policy.beta(obs[0]).unbind(dim=1)
-    policy.reset()
-    torch.testing.assert_close(policy(obs[0]), 2 * torch.distributions.Beta(alpha, beta).mean - 1)
-    policy.act = BetaMode((-1.0, 1.0))
-    policy.reset()
-    grid = torch.linspace(0.0005, 0.9995, 1000)
-    likelihood = torch.distributions.Beta(alpha[..., None], beta[..., None]).log_prob(grid)
-    torch.testing.assert_close(policy(obs[0]), 2 * grid[likelihood.argmax(dim=2)] - 1, atol=2.1e-3, rtol=0.0)
 
 
 @pytest.mark.parametrize("tokens", [1, 8, 14])

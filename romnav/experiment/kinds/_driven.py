@@ -59,8 +59,6 @@ class Driven:
         robots: tuple[str, ...] = ("navigation.dynamics",)
         if self.settings.navigation.stair_limits is not None:
             robots += ("navigation.stair_limits",)
-        if self.settings.navigation.action != "mean":
-            robots += ("navigation.action",)
         if self.filtered:
             robots += ("safety.filter", "safety.sensor", "safety.corruption")
         if self.policy is None:
@@ -108,9 +106,7 @@ class Driven:
         seen = perception(self.work, self.policy, self.settings, world, noise=NOISE, device=device)
         depth = seen.depth.encoder if seen.depth else None
         path = self.policy.folder / "policy.pt"
-        action = self.settings.navigation.action
-        actor = checkpoint.load_actor(path, seen.encoder, device, depth_encoder=depth, action=action)
-        return rollout.Policy(actor, seen)
+        return rollout.Policy(checkpoint.load_actor(path, seen.encoder, device, depth_encoder=depth), seen)
 
     def provenance(self, stage: Stage, starts: str, spec: EvaluationSpec | TrialSpec) -> Provenance:
         """Where the rows of a stage come from; ``starts`` is the hash of the initial conditions."""

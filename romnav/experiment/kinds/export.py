@@ -55,7 +55,7 @@ def _export(driven: Driven, trained: Stage, stage: Stage, session: Session, prog
 
     path, settings = trained.folder / "policy.pt", driven.settings
     lidar, depth = frozen_encoders(driven.work, trained)
-    actor = checkpoint.load_actor(path, lidar, depth_encoder=depth, action=settings.navigation.action)
+    actor = checkpoint.load_actor(path, lidar, depth_encoder=depth)
     env = settings.navigation.env
     card = Card(
         arm=driven.arm,

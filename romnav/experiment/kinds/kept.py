@@ -140,9 +140,7 @@ def _judge(
         name = digest(file)[:16]
         if name in rows:
             continue
-        action = settings.navigation.action
-        actor = checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth, action=action)
-        driver = Policy(actor, seen)
+        driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
         robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
         env, spec = settings.navigation.env, settings.evaluation
         saved = checkpoint.read(file)

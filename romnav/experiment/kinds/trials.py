@@ -31,8 +31,7 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
     on that, otherwise on the reduced-order model with a body.
 
     Raises:
-        RomnavError: The arm drives the policy of another one on the same body by the same actions, or has the filter
-            in all it does.
+        RomnavError: The arm drives the policy of another one on the same body, or has the filter in all it does.
     """
     if work.project.filtered(arm):
         raise RomnavError(
@@ -40,8 +39,7 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
             "on; leave it out"
         )
     driver = work.project.driver(arm)
-    own = work.arm_settings(arm).navigation if driver != arm else None
-    if own and own.dynamics == "rom" and own.action == "mean":
+    if driver != arm and work.arm_settings(arm).navigation.dynamics == "rom":
         raise RomnavError(
             f"{work.project.file(work.project.having(arm)[0])}: arms.{arm}.policy: trials drive the "
             f"reduced-order model with a body; name {driver} in its place"

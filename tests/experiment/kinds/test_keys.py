@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from romnav.errors import RomnavError
 from romnav.experiment.graph.run import waves
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds import reports, trials
-from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.encoder import encoder, quality
 from romnav.experiment.kinds.episodes import episodes
 from romnav.experiment.kinds.navigation import navigation
@@ -122,21 +120,6 @@ def test_rows_of_a_guarded_arm_depend_on_the_filter(tmp_path: Path) -> None:
     assert changed == {"rom-guarded", "oracle-guarded"}
     with pytest.raises(RomnavError, match=r"guarded\.toml: arms\.oracle-guarded\.filter: trials have the filter both"):
         trials.trials(other, "safety", "oracle-guarded", 0)
-
-
-def test_rows_of_an_arm_depend_on_what_it_acts_by(tmp_path: Path) -> None:
-    here = workspace(tmp_path)
-    file = here.project.file("modes")
-    file.write_text(
-        'kind = "ablation"\ntitle = "t"\n[arms.rom-modes]\nlabel = "M"\npolicy = "rom"\nnavigation.action = "mode"\n'
-    )
-    here = Workspace(Project(tmp_path, tmp_path / "results"), here.scale)
-    means, modes = (Driven.by(here, arm, 0) for arm in ("rom", "rom-modes"))
-    assert means.policy == modes.policy
-    assert [driven.settings.navigation.action for driven in (means, modes)] == ["mean", "mode"]
-    for rows in (partial(episodes, here), partial(trials.trials, here, "safety")):
-        told = [rows(arm, 0).spec.get("navigation.action") for arm in ("rom", "rom-modes")]
-        assert told == [None, "mode"]
 
 
 def test_trials_are_out_of_date_when_a_scene_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
