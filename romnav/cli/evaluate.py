@@ -207,18 +207,19 @@ def check(at: AtScale) -> None:
 
 def _judge_kept(job: DeviceJob, names: list[str], seed: int | None) -> None:
     from romnav.evaluation.paired.progress import read
-    from romnav.experiment.kinds.kept import kept
+    from romnav.experiment.kinds.kept import elsewhere, kept
+    from romnav.experiment.kinds.policy import policy
 
-    stages = [kept(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
-    job.make(stages)
+    runs = [policy(job.work, n, s) for n in names for s in (job.project.seeds(n) if seed is None else (seed,))]
+    job.make([kept(job.work, str(run.arm), int(run.seed or 0)) for run in runs if not elsewhere(run)])
     rows = [
         {
-            "arm": stage.arm,
+            "arm": run.arm,
             "M steps": float(row["steps"]) / 1e6,
             **{key: float(row[key]) for key in KEPT_COLUMNS if key in row},
         }
-        for stage in stages
-        for row in read(stage.folder / stage.outputs[0])
+        for run in runs
+        for row in read(run.folder / "kept.csv")
     ]
     print_table("Success of kept policies in percent", rows, KEPT_COLUMNS)
 

@@ -22,6 +22,11 @@ EPISODES = "dev"
 """The set for choices; the one that tables are made of is not looked at on the way."""
 
 
+def elsewhere(trained: Stage) -> bool:
+    """Whether what the run kept lies on another machine, and how well it did is here."""
+    return not any((trained.folder / "kept").glob("*.pt")) and (trained.folder / "kept.csv").exists()
+
+
 def kept(work: Workspace, arm: str, seed: int) -> Stage:
     """Success of every policy kept so far along the run of a trained arm, which need not have ended.
 

@@ -13,7 +13,7 @@ from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session
 from romnav.experiment.kinds import kept as module
 from romnav.experiment.kinds import policy as policies
-from romnav.experiment.kinds.kept import kept, reports
+from romnav.experiment.kinds.kept import elsewhere, kept, reports
 from romnav.experiment.workspace import Workspace
 from romnav.report.paired import progress
 from tests.experiment.kinds.conftest import policy
@@ -43,6 +43,8 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     policy(folder / "kept" / "000004.pt", work, 2)
     second = kept(work, "rom", 0)
     assert second.key != first.key
+    run = policies.policy(work, "rom", 0)
+    assert not elsewhere(run)
     second.make(second, Session(), progress)
     assert len(walked) == 2 * once
     (figure,) = reports(work, "spawn-goal", [0])
@@ -50,6 +52,8 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     assert [path.parts[-3:-1] for path in figure.reads] == [("rom", "seed-0")]
     figure.make(figure, Session(), progress)
     assert (work.folder / "figures" / "spawn-goal-progress.png").stat().st_size > 10_000
+    (folder / "kept" / "000004.pt").unlink()
+    assert elsewhere(run)
     rows = read(folder / "kept.csv")
     assert [(row["iteration"], row["steps"]) for row in rows] == [("2", "100"), ("4", "200")]
     for row in rows:
