@@ -22,10 +22,11 @@ from romnav.world.world import World
 
 
 def to_command(actions: Tensor, spec: CommandSpec) -> Tensor:
-    """Velocity command (E, 3) in m/s and rad/s of actions (E, 3) in [-1, 1], which span the limits linearly.
+    """Velocity command (E, 3) in m/s and rad/s of actions (E, 3): [-1, 1] spans the limits linearly, others are cut.
 
     A policy that knows nothing yet therefore drifts forward, at the middle of [-reverse, forward], and gets about.
     """
+    actions = actions.clamp(-1.0, 1.0)
     forward = 0.5 * (spec.forward - spec.reverse + actions[:, 0] * (spec.forward + spec.reverse))
     return torch.stack([forward, actions[:, 1] * spec.lateral, actions[:, 2] * spec.turn], dim=1)
 

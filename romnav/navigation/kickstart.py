@@ -81,6 +81,7 @@ class Teacher:
         if self.actor.encoder is not None:
             raise RomnavError(f"{path}: a teacher that trained its encoder; kickstart from one with a frozen encoder")
         self.actor.requires_grad_(False)
+        self.path = path
         self.spec = spec
         self.digest = digest(path)
 
@@ -103,7 +104,16 @@ class KickstartedPPO(BoundedPPO):
         Args:
             teacher: Of this run.
             places: Gives the (E, 2) flags of `PLACES` of the present step.
+
+        Raises:
+            RomnavError: Its Betas are over other actions than the student's; or as `inherit`.
         """
+        support, own = (actor.distribution.action_range[1] for actor in (teacher.actor, self.actor))
+        if support != own:
+            raise RomnavError(
+                f"{teacher.path}: a teacher with navigation.policy.support = {support:g}, and its student has {own:g}; "
+                "give both the same"
+            )
         self.teacher, self.places = teacher, places
         self._entropy: float = self.entropy_coef
         self._divergence = self.symmetry.by_name["divergence"] = Divergence(teacher.spec)

@@ -149,7 +149,7 @@ class Attention(nn.Module):
 
 
 class NavigationActor(MLPModel):
-    """rsl-rl actor: attention over LiDAR tokens, GRU, dense layer, Betas over [-1, 1]^3.
+    """rsl-rl actor: attention over LiDAR tokens, GRU, dense layer, Betas over [-s, s]^3, s being `PolicySpec.support`.
 
     In updates it takes whole rollouts (T, B, ...) and, in place of padding masks, the (T, B) episode starts. Of the
     observations it reads as much as those had that it was made for: one for the reduced-order model drives a humanoid,
@@ -183,7 +183,7 @@ class NavigationActor(MLPModel):
             obs_set,
             output_dim,
             hidden_dims=[spec.hidden],
-            distribution_cfg={"class_name": "BetaDistribution"},
+            distribution_cfg={"class_name": "BetaDistribution", "action_range": (-spec.support, spec.support)},
         )
         self.state_embedding = nn.Sequential(nn.Linear(self.obs_dim + BEARING, embedding), nn.ELU())
         self.attention = type(self).reader(tokens, channels, embedding, spec)

@@ -128,6 +128,9 @@ class PolicySpec(Config):
     """Width of the two-layer GRU (A)."""
     hidden: Width = 128
     """Width of the dense layer before the Beta parameters (A)."""
+    support: float = Field(default=1.0, ge=1.0, le=2.0, exclude_if=lambda support: support == 1.0)
+    """Breadth of what the Betas draw from over the limits of the command, beyond which actions are cut (A: 1; but the
+    mean of a Beta stays short of the ends of its support, and a policy that acts by means short of its fastest)."""
     critic: tuple[Width, ...] = Field(default=(128, 128), min_length=1)
     """Hidden widths of the privileged critic (A)."""
     network: Annotated[str, NETWORKS] | None = Field(default=None, exclude_if=lambda network: network is None)

@@ -23,6 +23,7 @@ def test_command_limits_are_the_papers() -> None:
     corner = torch.tensor([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0], [0.0, 0.0, 0.0]])
     expected = [[1.0, 0.25, 1.0], [-0.5, -0.25, -1.0], [0.25, 0.0, 0.0]]
     assert to_command(corner, CommandSpec()).tolist() == expected
+    assert to_command(1.5 * corner, CommandSpec()).tolist() == expected
 
 
 def test_same_seed_same_run(world: World, perception: object, spec: NavigationSpec) -> None:

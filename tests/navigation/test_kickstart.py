@@ -253,6 +253,9 @@ def test_teachers_that_do_not_fit_are_refused(
         train.train(spec, world, FakePerception(), tmp_path / "b", 1, kickstart=(SPEC, own))
     with pytest.raises(RomnavError, match="no such policy"):
         train.train(spec, world, FakePerception(), tmp_path / "c", 1, kickstart=(SPEC, tmp_path / "none.pt"))
+    wider = spec.model_copy(update={"policy": spec.policy.model_copy(update={"support": 1.2})})
+    with pytest.raises(RomnavError, match=r"policy\.support = 1, and its student has 1\.2"):
+        train.train(wider, world, FakePerception(), tmp_path / "d", 1, kickstart=(SPEC, teacher))
 
 
 def test_places_of_the_robots(world: World, spec: NavigationSpec) -> None:

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from scipy import stats
 from tensordict import TensorDict
 
 from romnav.navigation.policy import Attention, NavigationActor, RecurrentCore
@@ -12,10 +13,10 @@ from romnav.navigation.spec import PolicySpec
 SPEC = PolicySpec(attention=16, heads=2, queries=4, recurrent=16, hidden=16)
 
 
-def actor(tokens: int = 5, channels: int = 8) -> NavigationActor:
+def actor(tokens: int = 5, channels: int = 8, spec: PolicySpec = SPEC) -> NavigationActor:
     torch.manual_seed(0)
     obs = TensorDict({"lidar": torch.zeros(1, tokens, channels), "state": torch.zeros(1, 9)}, batch_size=[1])
-    return NavigationActor(obs, {"actor": ["state"]}, "actor", 3, SPEC)
+    return NavigationActor(obs, {"actor": ["state"]}, "actor", 3, spec)
 
 
 def rollout(steps: int, batch: int) -> TensorDict:
@@ -131,17 +132,23 @@ def test_select_keeps_the_right_memories() -> None:
     torch.testing.assert_close(policy(obs[1][keep]), whole[keep])
 
 
-def test_actions_are_bounded_beta_samples() -> None:
-    policy, obs = actor(), rollout(1, 64)
+@pytest.mark.parametrize("support", [1.0, 1.2])
+def test_actions_are_bounded_beta_samples(support: float) -> None:
+    policy, obs = actor(spec=SPEC.model_copy(update={"support": support})), rollout(1, 64)
     policy.reset()
-    samples = torch.stack([policy(obs[0], stochastic_output=True) for _ in range(50)])
-    assert samples.min() >= -1.0
-    assert samples.max() <= 1.0
+    drawn = []
+    for _ in range(50):
+        memory = policy.get_hidden_state()
+        drawn.append(policy(obs[0], stochastic_output=True))
+    samples = torch.stack(drawn)
+    assert samples.min() >= -support
+    assert 0.9 * support < samples.max() <= support
     alpha, beta = policy.output_distribution_params
-    expected = torch.distributions.Beta(alpha, beta).log_prob((samples[-1] + 1) / 2).sum(dim=1) - 3 * torch.log(
-        torch.tensor(2.0)
-    )
-    torch.testing.assert_close(policy.get_output_log_prob(samples[-1]), expected)
+    law = stats.beta(alpha.detach(), beta.detach(), -support, 2 * support)
+    expected = torch.from_numpy(law.logpdf(samples[-1].detach())).sum(dim=1).float()
+    torch.testing.assert_close(policy.get_output_log_prob(samples[-1]), expected, rtol=1e-4, atol=1e-4)
+    policy.reset(hidden_state=memory)
+    assert policy(obs[0]).detach().numpy() == pytest.approx(law.mean(), abs=1e-5)
 
 
 @pytest.mark.parametrize("tokens", [1, 8, 14])

@@ -49,7 +49,9 @@ class Sight:
     heading: NDArray[np.float32]
     """(K,) of the sensor, rad."""
     beta: NDArray[np.float32]
-    """(K, 2, 3) parameters of the actions' Beta distributions over [-1, 1]."""
+    """(K, 2, 3) parameters of the actions' Beta distributions."""
+    support: float
+    """They are over [-support, support]; [-1, 1] spans the limits of the command."""
 
     def points(self, step: int) -> NDArray[np.float32]:
         """(P, 3) returns of a step, tile frame, m."""
@@ -165,6 +167,7 @@ class _Witness:
             origin=torch.stack(origin).numpy(),
             heading=torch.stack(heading).numpy(),
             beta=torch.stack(self.beta).numpy(),
+            support=self.driver.actor.distribution.action_range[1],
         )
 
 

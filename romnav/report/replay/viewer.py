@@ -306,8 +306,9 @@ class Viewer:
             colours = matplotlib.colormaps["viridis_r"](np.clip(sight.ranges[step] / RANGE, 0, 1))[..., :3]
             self._range.image = _enlarged(np.where(sight.ranges[step][..., None] > 0, 255 * colours, 0))
             alpha, beta = sight.beta[step]
-            grid = np.linspace(-1.0, 1.0, 101)
-            density = [stats.beta.pdf((grid + 1) / 2, a, b) / 2 for a, b in zip(alpha, beta, strict=True)]
+            reach = sight.support
+            grid = np.linspace(-reach, reach, 101)
+            density = [stats.beta.pdf(grid, a, b, -reach, 2 * reach) for a, b in zip(alpha, beta, strict=True)]
             self._betas.data = (grid, *(np.nan_to_num(d, posinf=0.0) for d in density))
             for shown in (self._range, self._betas, self._points):
                 shown.visible = True
