@@ -49,7 +49,7 @@ def draw(arms: Mapping[str, pd.DataFrame], path: Path) -> None:
         arms: Rows of ``kept.csv`` by label.
         path: Figure; its suffix names the format.
     """
-    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
+    figure = Figure(figsize=(10.0, 3.2 + 0.16 * len(arms)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(PANELS)))
     for panel, (over, column, title) in zip(axes, PANELS, strict=True):
         for colour, (label, rows) in zip(cycle(COLOURS), arms.items(), strict=False):
@@ -69,4 +69,4 @@ def _finish(panel: Axes, over: str) -> None:
     panel.xaxis.set_major_formatter("{x:g}")
     panel.set_xlabel(over)
     panel.grid(alpha=0.25)
-    panel.legend(frameon=False, fontsize=7, loc="lower right")
+    panel.legend(frameon=False, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14))
