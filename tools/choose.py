@@ -11,11 +11,13 @@ for the difference of two policies. The log of experiments (docs/experiments.md)
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
+from romnav.errors import RomnavError
 from romnav.evaluation.episodes import draw, load, terrain
 from romnav.evaluation.paired.run import run
 from romnav.evaluation.rollout import Policy, View
@@ -51,6 +53,13 @@ class Altered(Policy):
         return to_command(self.factor * action, view.env.command)
 
 
+def positive(text: str) -> float:
+    """A number above 0, for argparse."""
+    if (number := float(text)) > 0.0:
+        return number
+    raise argparse.ArgumentTypeError(f"{text} is not above 0")
+
+
 def main() -> None:
     """Print a row for every policy and way of acting."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -58,15 +67,16 @@ def main() -> None:
     parser.add_argument("--file", default="policy.pt", help="policy in the arm's folder")
     parser.add_argument("--scale", default="cpu")
     parser.add_argument("--act", nargs="+", choices=("mean", "mode"), default=["mean"], help="of the Betas")
-    parser.add_argument("--factor", nargs="+", type=float, default=[1.0], help="on actions, before they are cut")
-    parser.add_argument("--forget", nargs="+", type=float, default=[float("inf")], help="all memory every so many s")
-    parser.add_argument("--goals", type=int, default=2048)
+    parser.add_argument("--factor", nargs="+", type=positive, default=[1.0], help="on actions, before they are cut")
+    parser.add_argument("--forget", nargs="+", type=positive, default=[float("inf")], help="all memory every so many s")
+    parser.add_argument("--goals", type=positive, default=2048)
     chosen = parser.parse_args()
 
     dev = load(DEV)
     work = Workspace(Project(ROOT, ROOT / "results"), chosen.scale)
     world = terrain(dev, DEV, work.project.worlds)
-    spec = EpisodeSetSpec(world=dev.world, episodes=chosen.goals, cross=chosen.goals, seed=SEED)
+    count = max(round(chosen.goals), 1)
+    spec = EpisodeSetSpec(world=dev.world, episodes=count, cross=count, seed=SEED)
     episodes = draw("choose", spec, world)
     for arm in chosen.arms:
         trained, settings = policy(work, arm, 0), work.arm_settings(arm)
@@ -88,4 +98,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except RomnavError as error:
+        sys.exit(f"error: {error}")
