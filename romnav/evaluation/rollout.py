@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Protocol
 
@@ -126,6 +127,11 @@ class Straight:
 SCRIPTED: dict[str, type[Oracle] | type[Straight]] = {"oracle": Oracle, "straight": Straight}
 
 
+def step_limit(duration: float, period: float) -> int:
+    """Steps of ``period`` that fit into ``duration``, both in s."""
+    return math.floor(duration / period + 1e-6)
+
+
 class Outcomes:
     """How and when the episodes of a view end, and the way that they took."""
 
@@ -138,7 +144,8 @@ class Outcomes:
             reach: Distance to the goal that is success, in 3D, m.
         """
         count, device = len(view.episode), view.goal.device
-        self._view, self._duration, self._reach = view, duration, reach
+        self._view, self._reach = view, reach
+        self._limit = step_limit(duration, view.env.period)
         self._success_time = torch.full((count,), torch.nan, dtype=torch.float64, device=device)
         self._time = torch.full((count,), duration, dtype=torch.float64, device=device)
         self._path = torch.zeros(count, dtype=torch.float64, device=device)
@@ -150,13 +157,11 @@ class Outcomes:
 
     def steps(self, progress: Progress | None) -> Iterator[int]:
         """Numbers of the steps, from 1, until no episode runs."""
-        period = self._view.env.period
-        limit = round(self._duration / period)
-        for step in range(1, limit + 1):
+        for step in range(1, self._limit + 1):
             yield step
             if progress:
                 reached = float((~self._success_time.isnan()).double().mean())
-                progress(step if self.left else limit, limit, f"reached {reached:.0%}, running {self.left}")
+                progress(step if self.left else self._limit, self._limit, f"reached {reached:.0%}, running {self.left}")
             if not self.left:
                 return
 
@@ -176,7 +181,7 @@ class Outcomes:
         self._success_time[row[reached]] = now
         self._time[row[reached | over]] = now
         self._fell[row[over]] = True
-        ended = reached | over | (alive & (view.step == round(self._duration / view.env.period)))
+        ended = reached | over | (alive & (view.step == self._limit))
         if ended.any():
             self._final[row[ended]] = view.geodesic()[0].double()[ended]
             self._running[row[ended]] = False

@@ -16,6 +16,8 @@ from romnav.world.spec import SamplerSpec, WorldSpec
 
 ROWS_VERSION = 2
 """Of the schema of episode rows; rows of an earlier one are out of date."""
+HORIZONS = (45, 120)
+"""Evaluation horizons, s (paper, Sec. IV-A): the training budget, and the end of an episode."""
 METRICS = Kind("metric", "romnav.metrics", "romnav.evaluation.paired.metrics:Measure")
 
 
@@ -45,7 +47,7 @@ class EvaluationSpec(Config):
 
     episodes: Name = "paired-2"
     """Episode set, a file under experiments/episodes/."""
-    duration: Positive = 120.0
+    duration: float = Field(default=120.0, gt=0.0, le=HORIZONS[-1])
     """Longest episode, s (P); success within 45 s is read off the same episode."""
     reach: Positive = 0.5
     """Distance to the goal that is success, m (P; A: in 3D, or a goal would be reached from another floor)."""

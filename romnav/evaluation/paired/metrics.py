@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from romnav.evaluation import spec as specs
-from romnav.evaluation.paired.rows import HORIZONS, HOW, SUCCESS_RADIUS, WHERE
+from romnav.evaluation.paired.rows import HOW, SUCCESS_RADIUS, WHERE
+from romnav.evaluation.spec import HORIZONS
 
 Level = Literal["all", "same", "cross"]
 LEVELS: tuple[Level, ...] = ("all", "same", "cross")

@@ -23,11 +23,11 @@ from romnav.robot.dynamics import Body
 from romnav.world.world import STOREY, World
 
 COLUMNS = (
-    *("policy", "episodes", "iteration", "steps", "hours"),
+    *("policy", "conditions", "iteration", "steps", "hours"),
     *(f"sr_{horizon}_{level}" for horizon in (45, 120) for level in (*LEVELS, "storey")),
     *("spl", "t2g"),
 )
-"""Digests of policy and episode set, place in the run, success rates in percent by level and over climbs of a storey
+"""Digests of the policy and of what it was judged by, place in the run, success rates in percent by level and over climbs of a storey
 or more, SPL, and time to goal in s."""
 
 

@@ -12,10 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from romnav.errors import RomnavError
 from romnav.evaluation.rowfile import POSES, Provenance, RowFile
-from romnav.evaluation.spec import ROWS_VERSION
+from romnav.evaluation.spec import HORIZONS, ROWS_VERSION
 
-HORIZONS = (45, 120)
-"""Evaluation horizons, s (paper, Sec. IV-A): the training budget, and the end of an episode."""
 SUCCESS_RADIUS = 0.5
 """Distance to the goal that counts as success, m (paper, Sec. IV-A)."""
 WHERE = ("same level", "never on a stair", "on a stair", "on the goal's level")

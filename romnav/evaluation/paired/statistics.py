@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from romnav.errors import RomnavError
 from romnav.evaluation.intervals import mcnemar_mid_p, percentile_interval, resampled_sums
 from romnav.evaluation.paired.metrics import LEVELS, Level, Metric, find, in_level, quantities
-from romnav.evaluation.paired.rows import HORIZONS, Arm
+from romnav.evaluation.paired.rows import Arm
+from romnav.evaluation.spec import HORIZONS
 
 Cluster = Literal["episode", "tile"]
 _DISJOINT: tuple[Level, ...] = ("same", "cross")

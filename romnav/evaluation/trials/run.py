@@ -18,7 +18,7 @@ from torch import Tensor
 
 from romnav import random
 from romnav.evaluation.episodes import EpisodeSet
-from romnav.evaluation.rollout import Driver, Outcomes, View
+from romnav.evaluation.rollout import Driver, Outcomes, View, step_limit
 from romnav.evaluation.shield import Shield
 from romnav.evaluation.spec import TrialSpec
 from romnav.navigation.spec import EnvSpec
@@ -172,7 +172,7 @@ def _drive(
     spec: TrialSpec,
     progress: Progress | None,
 ) -> tuple[dict[str, NDArray], _Log]:
-    count, limit = len(view.episode), round(spec.duration / view.env.period)
+    count, limit = len(view.episode), step_limit(spec.duration, view.env.period)
     view.noise = view.episode % (count // 2)
     filtered = filtered.to(view.episode.device)
     guarded = filtered.nonzero()[:, 0]

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from romnav.errors import RomnavError
-from romnav.experiment.graph import records
-from romnav.experiment.graph.run import execute
+from romnav.experiment.graph.run import execute, start_over
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import lines
 
@@ -62,8 +61,7 @@ def execute_on_ray(
         raise RomnavError("--on ray: Ray is not installed; run `pip install 'romnav[ray]'`") from error
     stages = list(stages)
     if not session.resume:
-        for stage in stages:
-            records.begin(stage, resume=False)
+        start_over(stages, say)
         session = replace(session, resume=True)  # a stage that goes on elsewhere must not start over
     try:
         ray.init(address if address != "ray" else None, log_to_driver=False, logging_level="ERROR")

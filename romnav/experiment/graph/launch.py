@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 
 from romnav import stopping
 from romnav.errors import RomnavError
@@ -71,7 +71,7 @@ def side_by_side(commands: Mapping[str, Sequence[str]], workers: int) -> None:
     with lines(list(commands)) as show, ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(run, name, arguments) for name, arguments in commands.items()]
         try:
-            for future in futures:
+            for future in as_completed(futures):
                 future.result()
         except BaseException:
             stop.set()

@@ -162,34 +162,38 @@ def _move(names: Sequence[str], source: Path, target: Path) -> None:
 
 
 def begin(stage: Stage, resume: bool) -> Record:
-    """Marks a resumable stage as begun; without ``resume``, drops what there is of it.
+    """Marks a stage as begun where it is resumable or is made again; without ``resume``, drops what there is of it.
+
+    Returns:
+        The record to finish, with what the stage is about to read.
 
     Raises:
         RomnavError: Its folder cannot be written, which is better known before the work than after it.
     """
-    record = Record(stage.key, stage.spec)
-    if stage.scratch:
-        if not resume or read(stage) is None:
-            for path in (stage.folder / name for name in (*stage.scratch, *stage.beside)):
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink(missing_ok=True)
+    above = {stage.name: read(stage) for stage in stage.upstream}
+    record = Record(stage.key, stage.spec, {name: other.outputs for name, other in above.items() if other})
+    old = read(stage)
+    if stage.scratch and (not resume or old is None):
+        for path in (stage.folder / name for name in (*stage.scratch, *stage.beside)):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    if stage.scratch or (old and old.key == stage.key):  # the old record would vouch for files that are replaced
         _write(stage, record)
     return record
 
 
-def finish(stage: Stage, record: Record, facts: dict[str, Any], seconds: float) -> None:
-    """Records a finished stage; a record that would only tell of another time and place stays as it is."""
-    old = read(stage)
-    above = {stage.name: read(stage) for stage in stage.upstream}
-    record.upstream = {name: other.outputs for name, other in above.items() if other}
+def finish(stage: Stage, record: Record, old: Record | None, facts: dict[str, Any], seconds: float) -> None:
+    """Records a finished stage; the ``old`` record stays if this one would only tell of another time and place."""
     record.outputs = {name: digest(stage.folder / name) for name in stage.outputs}
     record.facts = facts
-    if not old or any(getattr(old, name) != getattr(record, name) for name in ("key", "upstream", "outputs", "facts")):
+    if old and all(getattr(old, name) == getattr(record, name) for name in ("key", "upstream", "outputs", "facts")):
+        record = old
+    else:
         record.seconds = round(seconds, 1)
         record.provenance = provenance()
-        _write(stage, record)
+    _write(stage, record)
     for name in stage.scratch:  # a run that is killed before this goes on from there
         (stage.folder / name).unlink(missing_ok=True)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Callable, Collection, Iterable
-from functools import partial
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from romnav import files, ranks
@@ -125,9 +125,7 @@ def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None
         changed = "; ".join(records.differences(stage))
         say(f"{stage.name} (changed: {changed})" if changed else stage.name)
         try:
-            with held(
-                stage.record.with_name(f".{stage.record.name}.lock"), partial(_tell_of_waiting, stage, say)
-            ) as late:
+            with _locked(stage, say) as late:
                 there = records.retrieve(stage) or late
                 if there and session.resume and records.finished(stage):
                     say(f"{stage.name} is there")
@@ -148,13 +146,26 @@ def follow(targets: Iterable[Stage], session: Session) -> None:
 
 def _make(stage: Stage, session: Session) -> None:
     started = time.monotonic()
-    record = records.begin(stage, session.resume)
+    old, record = records.read(stage), records.begin(stage, session.resume)
     if stage.shared:
         ranks.call(stage.name)
     with bar(stage.name) as progress:
         facts = stage.make(stage, session, progress)
-    records.finish(stage, record, facts, time.monotonic() - started)
+    records.finish(stage, record, old, facts, time.monotonic() - started)
 
 
-def _tell_of_waiting(stage: Stage, say: Callable[[str], None], holder: str) -> None:
-    say(f"{stage.name}: waiting for {holder}, which makes it")
+def start_over(stages: Iterable[Stage], say: Callable[[str], None]) -> None:
+    """Drops what there is of the runs of stages before they are executed elsewhere; runs with other settings are kept."""
+    for stage in stages:
+        with _locked(stage, say):
+            records.retrieve(stage)
+            records.begin(stage, resume=False)
+
+
+def _locked(stage: Stage, say: Callable[[str], None]) -> AbstractContextManager[bool]:
+    """Holds the lock of a stage; tells whether another process held it before."""
+
+    def tell(holder: str) -> None:
+        say(f"{stage.name}: waiting for {holder}, which makes it")
+
+    return held(stage.record.with_name(f".{stage.record.name}.lock"), tell)

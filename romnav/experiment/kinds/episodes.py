@@ -86,6 +86,7 @@ def _evaluate(driven: Driven, joints: bool, stage: Stage, session: Session, prog
     work, settings, path = driven.work, driven.settings, paired_set(driven.work)
     paired = load(path)
     world = terrain(paired, path, work.project.worlds).to(session.device)
+    provenance = driven.provenance(stage, paired.digest, settings.evaluation)
     driver = driven.driver(world, session.device)
     recorder = postures.PostureRecorder() if joints else tracks.Recorder()
     env, spec, robots = settings.navigation.env, settings.evaluation, driven.body(session.device)
@@ -104,7 +105,6 @@ def _evaluate(driven: Driven, joints: bool, stage: Stage, session: Session, prog
     ways, period = recorder.tracks(count), settings.navigation.env.period
     columns["level"] = np.asarray(columns["level"])
     columns["where"], columns["how"] = classify(ways, columns, world, period)
-    provenance = driven.provenance(stage, paired.digest, settings.evaluation)
     rows.write(stage.folder / "episodes.parquet", rows.make(columns, provenance))
     source = {name: str(value) for name, value in provenance.model_dump().items()}
     tracks.write(stage.folder / "tracks.npz", ways, source)

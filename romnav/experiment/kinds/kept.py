@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -107,7 +109,7 @@ def _draw(
     session: Session,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Of the mean over training seeds at each number of steps, those of what a run begins with included."""
+    """Of every training seed, the steps of what a run begins with included."""
     import pandas as pd
 
     from romnav.report.paired.progress import draw, read
@@ -117,9 +119,7 @@ def _draw(
         before = {name: sum(facts.get(name, 0.0) for facts in found) for name in ("steps", "hours")}
         return rows.assign(**{name: rows[name] + spent for name, spent in before.items()})
 
-    frames = {label: pd.concat([whole(*run) for run in runs]) for label, runs in judged.items()}
-    means = {label: frame.groupby("steps", as_index=False).mean(numeric_only=True) for label, frame in frames.items()}
-    draw(means, stage.folder / stage.outputs[0])
+    draw({label: [whole(*run) for run in runs] for label, runs in judged.items()}, stage.folder / stage.outputs[0])
     return {}
 
 
@@ -137,20 +137,31 @@ def _judge(
     world = terrain(episodes, path, work.project.worlds).to(session.device)
     seen = perception(work, trained, settings, world, noise=NOISE, device=session.device)
     depth = seen.depth.encoder if seen.depth else None
-    # policies that are gone keep their rows
-    rows: dict[str, Mapping[str, Any]] = {
-        row["policy"]: row for row in along.read(stage.folder / "kept.csv") if row["episodes"] == episodes.digest
+    conditions = _conditions(stage, policies)
+    # policies that are gone keep their rows; one that a run made again replaces the earlier one
+    rows: dict[int, Mapping[str, Any]] = {
+        int(row["iteration"]): row
+        for row in (along.read(stage.folder / "kept.csv") if session.resume else ())
+        if row["conditions"] == conditions
     }
     for file in policies:
-        name = digest(file)[:16]
-        if name in rows:
+        name, iteration = digest(file)[:16], int(file.stem)
+        if iteration in rows and rows[iteration]["policy"] == name:
             continue
         driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
         robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
         env, spec = settings.navigation.env, settings.evaluation
         saved = checkpoint.read(file)
-        place = {"policy": name, "episodes": episodes.digest, "iteration": int(file.stem)}
+        place = {"policy": name, "conditions": conditions, "iteration": iteration}
         place |= {"steps": saved["steps"], "hours": saved["hours"]}
-        rows[name] = place | along.judge(driver, world, episodes, env, spec, progress, robots)
-        files.write(stage.folder / "kept.csv", files.csv_text(list(rows.values()), along.COLUMNS))
+        rows[iteration] = place | along.judge(driver, world, episodes, env, spec, progress, robots)
+        files.write(stage.folder / "kept.csv", files.csv_text([rows[i] for i in sorted(rows)], along.COLUMNS))
     return {"policies": len(policies)}
+
+
+def _conditions(stage: Stage, policies: Sequence[Path]) -> str:
+    """Digest of what policies are judged by: episodes, settings and encoders."""
+    judged = {path.name for path in policies}
+    spec = {name: value for name, value in stage.spec.items() if name not in judged}
+    text = json.dumps([spec, [above.key for above in stage.upstream]], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

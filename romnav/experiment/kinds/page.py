@@ -78,13 +78,17 @@ def _curves(work: Workspace, notes: list[str]) -> dict[str, tuple[list[Curves], 
             continue
         done = curves.finished(runs)
         try:
-            arms = curves.read(work, experiment, runs)
             ended = curves.read(work, experiment, done)
             drawn = experiment.declared(name, {"curves"}).tables if done else ()
             made = [curves.tabulate(work, name, table, ended, done) for table in drawn]
+            # the seeds of an arm make one curve, for which those that still train are too short: one of them stands alone
+            alone = {run.arm: run for run in reversed(runs) if run.arm not in ended}
+            curved = [run for run in runs if run in done or run is alone.get(run.arm)]
+            arms = curves.read(work, experiment, curved)
         except RomnavError as error:
             notes.append(f"no learning curves of {name}: {error}")
             continue
+        notes += [f"no learning curve of {run.name}: its run has not ended" for run in runs if run not in curved]
         shown |= {run.name for run in runs}
         found[experiment.title] = (list(arms.values()), made)
     return found
@@ -92,8 +96,13 @@ def _curves(work: Workspace, notes: list[str]) -> dict[str, tuple[list[Curves], 
 
 def _galleries(work: Workspace, arms: Sequence[str], notes: list[str]) -> dict[str, EpisodeGallery]:
     """Episodes by arm, and by training seed where an arm has several."""
-    files = sorted(work.folder.glob("*/seed-*/episodes.parquet"))
-    places = [(file.parts[-3], int(file.parts[-2].removeprefix("seed-"))) for file in files]
+    places = []
+    for file in sorted(work.folder.glob("*/seed-*/episodes.parquet")):
+        arm, seed = file.parts[-3], file.parts[-2].removeprefix("seed-")
+        if seed.isdecimal() and (arm in work.project.arms or arm in SCRIPTED):
+            places.append((arm, int(seed)))
+        else:
+            notes.append(f"no episodes of {file.parent}: no arm and training seed of an experiment")
     places.sort(key=lambda place: work.project.driver(place[0]) in SCRIPTED)
     for arm in arms:
         if arm not in {name for name, _ in places}:

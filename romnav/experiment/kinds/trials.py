@@ -76,6 +76,7 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
     world = scene_world(scenes).to(session.device)
     settings, spec = driven.settings, getattr(driven.settings, kind)
     walks = settings.navigation.dynamics == "g1"
+    provenance = driven.provenance(stage, draw(scenes, world, spec).digest, spec)
     columns = run(
         driven.driver(world, session.device),
         scenes,
@@ -86,7 +87,6 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
         body=humanoid(driven.work, settings, driven.seed, session.device, spec.threads) if walks else None,
         arms=settings.locomotion.robot if walks else None,
     )
-    provenance = driven.provenance(stage, draw(scenes, world, spec).digest, spec)
     rows.write(stage.folder / stage.outputs[0], rows.TrialRows(driven.arm, driven.seed, columns, provenance))
     return {}
 

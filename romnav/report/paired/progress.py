@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 
@@ -22,11 +22,21 @@ PANELS = (
 )
 
 
-def slope(steps: pd.Series, rate: pd.Series) -> float:
-    """Points of success that a doubling of the steps gives, by least squares; NaN of fewer than two policies."""
-    if len(steps) < 2:
-        return float("nan")
-    return float(np.polyfit(np.log2(steps.to_numpy(float)), rate.to_numpy(float), 1)[0])
+def slope(runs: Sequence[pd.DataFrame], rate: str) -> float:
+    """Points of ``rate`` that a doubling of the steps gives, by least squares with an intercept for each run.
+
+    Args:
+        runs: Rows of ``kept.csv``, one table a training seed.
+        rate: Column of success.
+
+    Returns:
+        The gain; NaN where no run has two policies.
+    """
+    x, y = (
+        np.concatenate([values - values.mean() for values in columns])
+        for columns in ([np.log2(run["steps"].to_numpy(float)) for run in runs], [run[rate] for run in runs])
+    )
+    return float(x @ y / (x @ x)) if x.any() else float("nan")
 
 
 def read(path: Path) -> pd.DataFrame:
@@ -42,21 +52,23 @@ def read(path: Path) -> pd.DataFrame:
         raise RomnavError(f"{path}: damaged ({error}); delete it and judge the kept policies again") from error
 
 
-def draw(arms: Mapping[str, pd.DataFrame], path: Path) -> None:
-    """Draw success against steps and hours of every arm, with its gain per doubling of the steps.
+def draw(arms: Mapping[str, Sequence[pd.DataFrame]], path: Path) -> None:
+    """Draw success against steps and hours of every arm, a line a training seed, with its gain per doubling of the steps.
 
     Args:
-        arms: Rows of ``kept.csv`` by label.
+        arms: Rows of ``kept.csv``, one table a training seed, by label.
         path: Figure; its suffix names the format.
     """
     figure = Figure(figsize=(10.0, 3.2 + 0.16 * len(arms)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(PANELS)))
     for panel, (over, column, title) in zip(axes, PANELS, strict=True):
-        for colour, (label, rows) in zip(cycle(COLOURS), arms.items(), strict=False):
-            gain = slope(rows["steps"], rows[column])
+        for colour, (label, runs) in zip(cycle(COLOURS), arms.items(), strict=False):
+            gain = slope(runs, column)
             told = label if np.isnan(gain) else f"{label} ({gain:+.1f} a doubling)"
-            x = rows["steps"] / 1e6 if over == "steps" else rows[over]
-            panel.plot(x, rows[column], color=colour, marker="o", markersize=3, label=literal(told))
+            for run in runs:
+                x = run["steps"] / 1e6 if over == "steps" else run[over]
+                (line,) = panel.plot(x, run[column], color=colour, marker="o", markersize=3)
+            line.set_label(literal(told))
         panel.set_title(title, fontsize=9)
         _finish(panel, "million steps" if over == "steps" else "hours of training")
     axes[0].set_ylabel("success on the episodes for choices (%)")

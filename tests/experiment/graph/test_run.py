@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
-from romnav.experiment.graph.run import execute, pending, prepare, require, waves, with_all_above
+from romnav.experiment.graph.run import execute, pending, prepare, require, start_over, waves, with_all_above
 from romnav.experiment.graph.stage import Session, Stage
 
 KEYS = "abcdef"
@@ -116,7 +116,7 @@ def test_another_upstream_output_reruns_what_read_the_old_one(chain: list[Stage]
     (chain[0].folder / "out.txt").write_text("made by another machine")
     record = records.read(chain[0])
     assert record is not None
-    records.finish(chain[0], record, {}, 0.0)
+    records.finish(chain[0], record, None, {}, 0.0)
     assert run(chain) == ["b", "c"]
 
 
@@ -423,7 +423,7 @@ def test_a_report_is_drawn_again_when_what_it_shows_has_changed_and_not_before(c
     (chain[1].folder / "out.txt").write_text("made by another machine")
     record = records.read(chain[1])
     assert record is not None
-    records.finish(chain[1], record, {}, 0.0)
+    records.finish(chain[1], record, None, {}, 0.0)
     assert not records.drawn(chain[2])
     (chain[2].folder / "out.txt").unlink()
     assert not records.drawn(report)
@@ -442,3 +442,51 @@ def test_what_cannot_be_written_is_known_before_the_first_stage_runs(tmp_path: P
     with pytest.raises(RomnavError, match="cannot be written"):
         prepare([first, last])
     assert not (first.folder / "out.txt").exists()
+
+
+def replace_upstream(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+    """As another process does while this one works."""
+    facts = write(stage, session, progress)
+    (above,) = stage.upstream
+    (above.folder / "out.txt").write_text("made by another process")
+    record = records.read(above)
+    assert record is not None
+    records.finish(above, record, None, {}, 0.0)
+    return facts
+
+
+def test_what_was_replaced_while_it_was_read_is_read_again(tmp_path: Path) -> None:
+    first = stage(tmp_path, "a", Settings())
+    second = stage(tmp_path, "b", Settings(), (first,), make=replace_upstream)
+    run([second])
+    assert run([replace(second, make=write)]) == ["b"]
+    assert "another process" in (second.folder / "out.txt").read_text()
+    assert run([second]) == []
+
+
+def die(stage: Stage, session: Session, progress: Any) -> dict[str, Any]:
+    """Replaces its output, and is killed before it is recorded."""
+    (stage.folder / "out.txt").write_text("half of it")
+    raise KeyboardInterrupt
+
+
+def test_a_stage_that_was_killed_while_made_again_is_made_again(chain: list[Stage]) -> None:
+    run(chain)
+    with pytest.raises(KeyboardInterrupt):
+        execute([replace(chain[0], make=die)], Session(resume=False))
+    assert run(chain) == ["a"]  # the same bytes came out
+    with pytest.raises(KeyboardInterrupt):  # so does one that changed settings; its old record stands
+        execute([replace(chain[1], make=die, settings=Settings(b=1))], Session())
+    old = records.read(chain[1])
+    assert old is not None and old.key == chain[1].key
+
+
+def test_starting_over_keeps_runs_with_other_settings(resumable: Callable[[Settings], Stage]) -> None:
+    one, other = resumable(Settings()), resumable(Settings(a=1))
+    for stage in (one, other):
+        with pytest.raises(KeyboardInterrupt):
+            execute([replace(stage, make=half)], Session())
+    start_over([one], lambda line: None)
+    assert not (one.folder / "checkpoint.pt").exists()
+    (aside,) = (one.folder / "replaced").iterdir()
+    assert (aside / "checkpoint.pt").read_text() == "1"

@@ -94,7 +94,7 @@ def test_an_evaluation_is_told_of(
     run = episode_rows("raw")
     rows.write(evaluated.folder / "episodes.parquet", run)
     (evaluated.folder / "tracks.npz").write_bytes(b"")
-    records.finish(evaluated, records.begin(evaluated, True), {}, 0.0)
+    records.finish(evaluated, records.begin(evaluated, True), None, {}, 0.0)
     execute(pending([export(work, "raw", 0)]), Session())
     measured = done[0].measured
     assert measured.digest == run.provenance.episode_set

@@ -47,6 +47,15 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     assert not elsewhere(run)
     second.make(second, Session(), progress)
     assert len(walked) == 2 * once
+    second.make(second, Session(), progress)
+    assert len(walked) == 2 * once
+    policy(folder / "kept" / "000004.pt", work, 3)  # as a run makes it that was killed and went on
+    third = kept(work, "rom", 0)
+    third.make(third, Session(), progress)
+    assert len(walked) == 3 * once
+    policy(folder / "kept" / "000004.pt", work, 2)
+    second.make(second, Session(), progress)
+    assert len(walked) == 4 * once
     (figure,) = reports(work, "spawn-goal", [0])
     assert not reports(work, "deploy", [0])  # it drives the same arm, but trains none
     assert [path.parts[-3:-1] for path in figure.reads] == [("rom", "seed-0")]
@@ -80,19 +89,19 @@ begin = "more"
 def test_what_a_run_begins_with_is_counted(work: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
     work.project.file("on").write_text(ON)
     monkeypatch.setattr(progress, "draw", lambda arms, path: drawn.update(arms))
-    drawn: dict[str, pd.DataFrame] = {}
+    drawn: dict[str, list[pd.DataFrame]] = {}
     for arm, steps in (("rom", 500), ("more", 300), ("most", 100)):
         stage = policies.policy(work, arm, 0)
         record = records.begin(stage, True)
         (stage.folder / "kept.csv").write_text(f"steps,hours,sr_120_all\n{steps / 2},0.5,60.0\n{steps},1.0,70.0\n")
         for name in stage.outputs:
             (stage.folder / name).write_text("made")
-        records.finish(stage, record, {"steps": steps, "hours": 1.0}, 0.0)
+        records.finish(stage, record, None, {"steps": steps, "hours": 1.0}, 0.0)
     (figure,) = reports(work, "on", [0])
     figure.make(figure, Session(), lambda done, total, text: None)
-    assert {label: list(rows["steps"]) for label, rows in drawn.items()} == {
+    assert {label: list(rows["steps"]) for label, (rows,) in drawn.items()} == {
         "RoM": [250.0, 500.0],
         "on": [650.0, 800.0],
         "on and on": [850.0, 900.0],
     }
-    assert list(drawn["on and on"]["hours"]) == [2.5, 3.0]
+    assert list(drawn["on and on"][0]["hours"]) == [2.5, 3.0]
