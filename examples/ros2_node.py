@@ -1,4 +1,5 @@
 """A ROS 2 node that drives a robot by an exported policy: clouds, odometry and a goal in, velocities out at 5 Hz.
+A policy of the humanoid also needs depth images and, from whatever walks the robot, its proprioception.
 
     python examples/ros2_node.py policy.onnx --ros-args -r cloud:=/livox/lidar -r odom:=/odom
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from romnav.deploy import Runner, Sensed
 
 STALE = 0.5
-"""A robot whose cloud, odometry or depth is older stands, s."""
+"""A robot whose cloud, odometry, depth or proprioception is older stands, s."""
 BASE = 0.79
 """Height of the odometry's frame above the ground, m: the pelvis of a standing G1."""
 STAND = (0.0, 0.0, 0.0)
@@ -85,7 +86,7 @@ class Navigator:
         self._goal: tuple[NDArray[np.float64], float] | None = None
 
     def hear(self, topic: str, message: Any, now: float) -> None:
-        """A message of "cloud", "odom", "depth" or "goal" at the time ``now``, s."""
+        """A message of "cloud", "odom", "depth", "proprioception" or "goal" at the time ``now``, s."""
         if topic == "goal":
             p = message.pose.position
             self._goal = np.array([p.x, p.y, p.z]), angles(message.pose.orientation)[2]
@@ -94,14 +95,16 @@ class Navigator:
 
     def velocity(self, now: float) -> tuple[float, float, float]:
         """Forward, left, m/s, and turn, rad/s, for the next period; the robot stands where something is missing."""
-        wanted = {"cloud", "odom"} | ({"depth"} if self.runner.card.depth else set())
+        card = self.runner.card
+        needed = {"cloud": True, "odom": True, "depth": card.depth, "proprioception": card.proprioception}
+        wanted = {topic for topic, need in needed.items() if need}
         fresh = {topic for topic, latest in self._latest.items() if now - latest.at <= STALE}
         if self._goal is None or wanted - fresh:
             return STAND
         pose = self._latest["odom"].value.pose.pose
         roll, pitch, yaw = angles(pose.orientation)
         depth = None
-        if (spec := self.runner.card.depth) is not None:
+        if (spec := card.depth) is not None:
             depth = subsample(image(self._latest["depth"].value), spec.rows, spec.columns)
         out = self.runner(
             Sensed(
@@ -112,6 +115,7 @@ class Navigator:
                 points=points(self._latest["cloud"].value) @ self._mount.T,
                 tilt=(roll, pitch),
                 depth=depth,
+                proprioception=self._latest["proprioception"].value.data if card.proprioception else (),
             )
         )
         forward, left, turn = map(float, out.command)
@@ -126,6 +130,7 @@ def main() -> None:
         from nav_msgs.msg import Odometry
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import Image, PointCloud2
+        from std_msgs.msg import Float32MultiArray
     except ImportError as error:
         sys.exit(f"error: {error.name} is missing; source a ROS 2 installation first")
     rclpy.init()
@@ -138,6 +143,8 @@ def main() -> None:
     kinds = {"cloud": PointCloud2, "odom": Odometry, "goal": PoseStamped}
     if navigator.runner.card.depth:
         kinds["depth"] = Image
+    if navigator.runner.card.proprioception:
+        kinds["proprioception"] = Float32MultiArray
     for topic, kind in kinds.items():
         quality = 10 if topic == "goal" else qos_profile_sensor_data
         node.create_subscription(kind, topic, lambda m, topic=topic: navigator.hear(topic, m, now()), quality)

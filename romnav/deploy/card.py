@@ -52,6 +52,8 @@ class Card(Config):
     """A command is held for so long, s."""
     command: CommandSpec
     """Limits of the command."""
+    stair_limits: tuple[float, float] | None = None
+    """Fastest forward command, m/s, and turn, rad/s, on stairs: the robot's locomotion has to keep them."""
     max_goal_distance: float
     """d_max of the goal observation, m."""
     lidar: LidarSpec

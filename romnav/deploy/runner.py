@@ -18,10 +18,15 @@ from romnav.deploy.card import Card
 from romnav.deploy.export import need
 from romnav.errors import RomnavError
 from romnav.navigation.observations import observe, rotate
+from romnav.robot.g1 import HEAD
 from romnav.safety.barrier import Status
 from romnav.safety.filter import SafetyFilter
 from romnav.safety.spec import SafetySpec
 from romnav.sensing.image import directions, level, project
+
+OWN = 0.26
+"""Returns nearer than this to the sensor are the robot's own, m: a G1 sees its arms at 0.17 to 0.24 m, and no solid
+comes nearer to a body of this radius."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +40,18 @@ class Sensed:
     position: ArrayLike
     """(3,) m."""
     yaw: float
-    """Heading, rad."""
+    """Heading of the torso, rad."""
     goal: ArrayLike
     """(3,) m."""
     goal_yaw: float
     """Heading to arrive with, rad."""
     points: ArrayLike | None = None
-    """(N, 3) returns of the LiDAR in the axes of the torso (x ahead, y left, z up), origin at the sensor, m."""
+    """(N, 3) returns of the LiDAR in the axes of the torso (x ahead, y left, z up), origin at the sensor, m; those on
+    the robot's own arms may be among them."""
     ranges: ArrayLike | None = None
     """(rows, columns) range image in place of the points, m, levelled; 0 is no return."""
     tilt: tuple[float, float] = (0.0, 0.0)
-    """Roll and pitch of the torso, rad, by which the points are levelled."""
+    """Roll and pitch of the torso, rad: by them the points are levelled, and they tell where the head is."""
     depth: ArrayLike | None = None
     """(rows, columns) depth image, m, for a policy that sees one."""
     proprioception: ArrayLike = ()
@@ -93,7 +99,6 @@ class Runner:
         options.intra_op_num_threads = options.inter_op_num_threads = threads
         self.session, self.card = _open(runtime, path, options)
         self._directions = directions(self.card.lidar)
-        self._mount = torch.tensor([0.0, 0.0, self.card.lidar.height])
         self._filter: SafetyFilter | None = None
         if safety is not None:
             command = self.card.command
@@ -122,10 +127,10 @@ class Runner:
         position, goal = (_array(name, getattr(sensed, name), (3,)) for name in ("position", "goal"))
         angles = torch.tensor([sensed.yaw, sensed.goal_yaw, *sensed.tilt], dtype=torch.float32)
         felt = _array("proprioception", sensed.proprioception, (self.card.proprioception,))
-        images, points = self._see(sensed)
         if not all(bool(x.isfinite().all()) for x in (position, goal, angles, felt)):
             stop = np.zeros(3, np.float32)
             return Velocity(stop, stop, Status.NOT_FINITE, time.perf_counter() - began)
+        images, points = self._see(sensed)
         robot = _Robot(position[None], angles[None, 0], felt[None])
         counters = torch.zeros(1, 2, dtype=torch.int64)
         d_max = self.card.max_goal_distance
@@ -137,23 +142,30 @@ class Runner:
         return Velocity(safe, command[0], status, time.perf_counter() - began)
 
     def _see(self, sensed: Sensed) -> tuple[dict[str, Tensor], Tensor]:
-        """Images (1, rows, columns) by sensor, and returns (N, 3) in the levelled LiDAR frame."""
+        """Images (1, rows, columns) by sensor, and returns (N, 3), levelled, from the ground beneath the robot."""
         lidar = self.card.lidar
         if (sensed.points is None) == (sensed.ranges is None):
             raise RomnavError("sensed: give the LiDAR's points or its ranges, one of them")
         if sensed.points is not None:
             points = level(_array("points", sensed.points, (None, 3)), *sensed.tilt)
             points = points[points.isfinite().all(dim=1)]
+            points = points[torch.linalg.vector_norm(points, dim=1) > OWN]
             ranges = project(points, lidar)
         else:
             ranges = _array("ranges", sensed.ranges, (lidar.rows, lidar.columns)).nan_to_num(0.0, 0.0, 0.0)
+            ranges = torch.where(ranges > OWN, ranges, 0.0)
             points = (ranges[..., None] * self._directions)[ranges > 0]
         images = {"lidar": ranges[None]}
         if (depth := self.card.depth) is not None:
             if sensed.depth is None:
                 raise RomnavError("sensed: the policy sees through a depth camera; give its image as depth")
             images["depth"] = _array("depth", sensed.depth, (depth.rows, depth.columns)).nan_to_num(0.0, 0.0, 0.0)[None]
-        return images, points
+        return images, points + self._head(sensed.tilt)
+
+    def _head(self, tilt: tuple[float, float]) -> Tensor:
+        """(3,) of the sensor above the ground beneath the robot: it leans ahead with the torso."""
+        upright = torch.tensor([HEAD])
+        return torch.tensor([0.0, 0.0, self.card.lidar.height]) + (level(upright, *tilt) - upright)[0]
 
     def _guard(self, robot: _Robot, points: Tensor, wanted: Tensor) -> tuple[NDArray[np.float32], Status]:
         if self._filter is None:
@@ -163,7 +175,7 @@ class Runner:
         moved = pose - before
         motion = torch.cat([rotate(moved[:, :2], before[:, 3]), moved[:, 2:]], dim=1)
         self._pose = pose
-        safe = self._filter((points + self._mount)[None], wanted[:, :2], None, motion)
+        safe = self._filter(points[None], wanted[:, :2], None, motion)
         status = Status(int(safe.status[0]))
         turn = torch.zeros(1) if status >= Status.OUTSIDE else wanted[0, 2:]
         return torch.cat([safe.velocity[0], turn]).numpy(), status

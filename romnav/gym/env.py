@@ -78,13 +78,14 @@ class RoMVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._world = build(settings.ground, work.project.worlds).to(device)
         self._device = device
         self._eyes = {name: self._eye(work, settings, name) for name in seen}
-        env = settings.navigation.env.model_copy(update={"envs": num_envs})
-        dynamics = body(work, settings, 0, device, torch.get_num_threads())(self._world, num_envs, env.period)
-        self._make = partial(NavigationEnv, self._world, dynamics, self._perceive, env, device=device)
-        self._env = self._make(seed=0)
+        self._body = partial(body, work, settings, device=device, threads=torch.get_num_threads())
+        self._task = settings.navigation.env.model_copy(update={"envs": num_envs})
         self.num_envs = num_envs
+        self.progress = 0.0
+        """Share of the training run that is done: it sets the weights of the reward that change on the way."""
+        self._env = self._make(0)
         self.single_action_space = Box(-1.0, 1.0, (ACTIONS,), np.float32)
-        self._spaces = self._bounds(settings, dynamics)
+        self._spaces = self._bounds(settings, self._env.dynamics)
         self.single_observation_space = Dict({**self._spaces})
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -96,7 +97,7 @@ class RoMVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         super().reset(seed=seed if seed is None or isinstance(seed, int) else seed[0])
         if seed is not None:
             number = seed if isinstance(seed, int) else hash(tuple(seed)) & 0x7FFFFFFF
-            self._env = self._make(seed=number)
+            self._env = self._make(number)
         else:
             self._env.restart(torch.arange(self.num_envs, device=self._device))
         self._env.episode_length_buf = torch.zeros_like(self._env.episode_length_buf)
@@ -107,6 +108,7 @@ class RoMVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """One control period."""
         with torch.no_grad():
+            self._env.progress = self.progress
             action = torch.as_tensor(actions, dtype=torch.float32, device=self._device).clamp(-1.0, 1.0)
             reward, fallen, timeout = self._env.advance(action)
             info: dict[str, Any] = {
@@ -121,6 +123,11 @@ class RoMVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
                 observed = self._observe()
         ended, truncated = fallen.cpu().numpy(), timeout.cpu().numpy()
         return observed, reward.double().cpu().numpy(), ended, truncated, info
+
+    def _make(self, seed: int) -> NavigationEnv:
+        """The task with robots of its own: what a humanoid has been through would go on with it."""
+        dynamics = self._body(seed=seed)(self._world, self.num_envs, self._task.period)
+        return NavigationEnv(self._world, dynamics, self._perceive, self._task, seed=seed, device=self._device)
 
     def _final(self, observed: Observation, done: NDArray[np.intp], success: NDArray[np.bool_]) -> dict[str, Any]:
         last = np.full(self.num_envs, None, object)
@@ -180,17 +187,35 @@ class RoMEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._of = RoMVectorEnv(1, **arguments)
         self.action_space = self._of.single_action_space
         self.observation_space = self._of.single_observation_space
+        self._next: Observation | None = None
+        """What the robot saw first of the episode that began when the last one ended."""
+
+    @property
+    def progress(self) -> float:
+        """As of `RoMVectorEnv`."""
+        return self._of.progress
+
+    @progress.setter
+    def progress(self, share: float) -> None:
+        self._of.progress = share
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode."""
         super().reset(seed=seed)
-        observed, _ = self._of.reset(seed=seed)
-        return {name: value[0] for name, value in observed.items()}, {"is_success": False}
+        observed, self._next = self._next, None
+        if observed is None or seed is not None:
+            observed, _ = self._of.reset(seed=seed)
+        return _first(observed), {"is_success": False}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control period."""
         observed, reward, ended, truncated, info = self._of.step(np.asarray(action)[None])
-        last = info["final_obs"][0] if "final_obs" in info else {name: value[0] for name, value in observed.items()}
+        self._next = observed if "final_obs" in info else None
+        last = info["final_obs"][0] if "final_obs" in info else _first(observed)
         return last, float(reward[0]), bool(ended[0]), bool(truncated[0]), {"is_success": bool(info["is_success"][0])}
+
+
+def _first(observed: Observation) -> Observation:
+    return {name: value[0] for name, value in observed.items()}

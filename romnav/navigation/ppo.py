@@ -41,7 +41,7 @@ class Rollout(RolloutStorage):
         starts = torch.zeros(self.num_transitions_per_env, self.num_envs, dtype=torch.bool, device=self.device)
         starts[1:] = self.dones[:-1, :, 0].bool()
         for _ in range(num_epochs):
-            for envs in torch.arange(self.num_envs).chunk(num_mini_batches):
+            for envs in torch.arange(self.num_envs).tensor_split(num_mini_batches):
                 part = slice(int(envs[0]), int(envs[-1]) + 1)
                 yield RolloutStorage.Batch(
                     observations=self.observations[:, part],

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from romnav.deploy import export as exporting
+from romnav.deploy.export import export
 from romnav.deploy.replay import Stream, replay
-from romnav.deploy.runner import Runner, Sensed
+from romnav.deploy.runner import OWN, Runner, Sensed
 from romnav.errors import RomnavError
 from romnav.navigation.observations import goal_observation
+from romnav.navigation.spec import CommandSpec
+from romnav.robot.g1 import HEAD, build_spec
+from romnav.robot.humanoid import _head_on
+from romnav.robot.spec import RobotSpec
+from romnav.robot.statics import NOTHING
 from romnav.safety.barrier import Status
 from romnav.safety.spec import SafetySpec
 from romnav.sensing.image import directions
-from tests.deploy.conftest import DEPTH, FELT, LIDAR
+from romnav.sensing.spec import LidarSpec
+from tests.deploy.conftest import DEPTH, FELT, LIDAR, actor, card, encoders
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +89,59 @@ def test_it_observes_as_the_simulator_does(runner: Runner, monkeypatch: pytest.M
 def test_points_of_a_leaning_robot_are_as_good_as_the_image(exported: Path) -> None:
     first, second = Runner(exported), Runner(exported)
     tilt = (0.05, 0.2)
-    by_image, by_points = first(sensed()), second(sensed(ranges=None, points=cloud(room(), *tilt), tilt=tilt))
+    by_image, by_points = first(sensed(tilt=tilt)), second(sensed(ranges=None, points=cloud(room(), *tilt), tilt=tilt))
     np.testing.assert_allclose(by_points.wanted, by_image.wanted, atol=1e-5)
     np.testing.assert_allclose(by_points.command, by_image.command, atol=1e-4)
+
+
+def arms() -> np.ndarray:
+    """(N, 3) returns of a G1's own arms in the axes of its torso, origin at the sensor."""
+    model = build_spec(RobotSpec(), NOTHING, visual=True).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    torso = data.body("torso_link")
+    axes = torso.xmat.reshape(3, 3)
+    ray = directions(LidarSpec()).double().numpy().reshape(-1, 3)
+    unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    of_arms = [any(part in model.body(b).name for part in ("shoulder", "elbow", "wrist")) for b in model.geom_bodyid]
+    model.geom_group[:] = np.where(of_arms, 5, 0)
+    geom, distance = np.full(len(unit), -1, np.int32), np.zeros(len(unit))
+    group = np.array([0, 0, 0, 0, 0, 1], np.uint8)
+    head = torso.xpos + axes @ HEAD
+    mujoco.mj_multiRay(model, data, head, (unit @ axes.T).ravel(), group, 1, -1, geom, distance, None, len(unit), 2.0)
+    return (unit * distance[:, None])[geom >= 0]
+
+
+def test_the_robots_own_arms_are_no_obstacles(exported: Path) -> None:
+    own, around = arms(), cloud(room())
+    assert len(own) > 100
+    clean, with_arms = Runner(exported), Runner(exported)
+    for _ in range(3):
+        one = clean(sensed(ranges=None, points=around))
+        other = with_arms(sensed(ranges=None, points=np.concatenate([around, own])))
+        np.testing.assert_array_equal(other.command, one.command)
+
+
+def test_the_filter_knows_where_the_head_of_a_leaning_robot_is(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    roll, pitch = 0.1, 0.4
+    turned = Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix()
+    joint = np.array([0.0, 0.0, LIDAR.height]) - HEAD
+    head = _head_on(torch.tensor(joint[None], dtype=torch.float32), torch.tensor(turned[None], dtype=torch.float32))
+    around = np.random.default_rng(0).uniform([-3, -3, 0], [3, 3, 2], (500, 3))  # from the ground beneath the robot
+    seen = (around - head.origin[0].numpy()) @ turned
+    runner = Runner(exported)
+    given: list[torch.Tensor] = []
+    real = runner._filter
+
+    def guard(points: torch.Tensor, *rest: Any) -> Any:
+        given.append(points)
+        assert real is not None
+        return real(points, *rest)
+
+    monkeypatch.setattr(runner, "_filter", guard)
+    runner(sensed(ranges=None, points=seen, tilt=(roll, pitch)))
+    kept = np.linalg.norm(seen, axis=1) > OWN
+    np.testing.assert_allclose(given[0][0].numpy(), around[kept], atol=1e-4)
 
 
 def test_a_command_keeps_the_limits_and_the_turn(runner: Runner) -> None:
@@ -109,6 +170,7 @@ def test_without_a_filter_the_policy_has_its_way(exported: Path) -> None:
     [
         ({"position": [np.nan, 0.0, 0.0]}, Status.NOT_FINITE),
         ({"goal": [np.inf, 0.0, 0.0]}, Status.NOT_FINITE),
+        ({"tilt": (np.inf, 0.0), "ranges": None, "points": np.ones((4, 3))}, Status.NOT_FINITE),
         ({"ranges": np.zeros((15, 55))}, Status.NO_POINTS),
         ({"ranges": None, "points": np.empty((0, 3))}, Status.NO_POINTS),
     ],
@@ -172,7 +234,12 @@ def test_another_stream_is_refused(tmp_path: Path) -> None:
             Stream.load(tmp_path / f"{name}.npz")
 
 
-def test_the_filter_has_the_limits_of_the_policy(exported: Path) -> None:
-    runner = Runner(exported, SafetySpec())
+def test_the_filter_has_the_limits_of_the_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporting, "STEPS", 1)
+    limits = CommandSpec(forward=0.7, reverse=0.3, lateral=0.15)
+    lidar, _ = encoders()
+    export(actor(lidar), lidar, None, card(period=0.1, command=limits), tmp_path / "policy.onnx", lambda *_: None)
+    runner = Runner(tmp_path / "policy.onnx", SafetySpec())
     assert runner._filter is not None
-    assert runner._filter.spec.filter.period == runner.card.period
+    barrier = runner._filter.spec.filter
+    assert (barrier.period, barrier.forward, barrier.reverse, barrier.lateral) == (0.1, 0.7, 0.3, 0.15)

@@ -9,6 +9,7 @@ import pytest
 
 from romnav.experiment.project import Project
 from romnav.experiment.workspace import Workspace
+from tests.deploy.conftest import exported as exported
 
 ROOT = Path(__file__).parents[2]
 SCALE = """

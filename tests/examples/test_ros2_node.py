@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from romnav.deploy.runner import Runner
 from romnav.safety.barrier import Status
 from romnav.sensing.spec import DepthSpec, LidarSpec
 
@@ -34,8 +35,8 @@ node = load()
 class FakeRunner:
     """Remembers what it sensed."""
 
-    def __init__(self, depth: DepthSpec | None = None) -> None:
-        self.card = Message(lidar=LidarSpec(), depth=depth, period=0.2)
+    def __init__(self, depth: DepthSpec | None = None, proprioception: int = 0) -> None:
+        self.card = Message(lidar=LidarSpec(), depth=depth, proprioception=proprioception, period=0.2)
         self.sensed: Any = None
 
     def __call__(self, sensed: Any) -> Any:
@@ -111,6 +112,22 @@ def test_a_robot_stands_while_anything_is_missing_or_old(missing: str) -> None:
     navigator.hear(missing, heard[missing], 1.2)
     assert navigator.velocity(1.4) != (0.0, 0.0, 0.0)
     assert navigator.velocity(1.8) == (0.0, 0.0, 0.0)
+
+
+def test_a_policy_of_the_humanoid_is_driven_by_the_real_runner(exported: Path) -> None:
+    navigator = node.Navigator(Runner(exported))
+    card = navigator.runner.card
+    assert card.depth is not None
+    shape = card.depth.rows, card.depth.columns
+    message = Message(encoding="32FC1", is_bigendian=0, height=shape[0], width=shape[1], step=4 * shape[1])
+    message.data = np.ones(shape, "<f4").tobytes()
+    navigator.hear("goal", goal(5.0, 1.0, 0.0, 0.0), 1.0)
+    navigator.hear("odom", odometry(0.0, 0.0, 0.79, 0.0, 0.0, 0.0), 1.0)
+    navigator.hear("cloud", cloud(np.random.default_rng(0).normal(0.0, 3.0, (500, 3))), 1.0)
+    navigator.hear("depth", message, 1.0)
+    assert navigator.velocity(1.0) == (0.0, 0.0, 0.0)  # it does not feel itself yet
+    navigator.hear("proprioception", Message(data=np.linspace(-1, 1, card.proprioception)), 1.0)
+    assert navigator.velocity(1.0) != (0.0, 0.0, 0.0)
 
 
 def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

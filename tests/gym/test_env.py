@@ -95,6 +95,27 @@ def test_one_robot_is_the_first_of_many(project: Path) -> None:
         assert reward == pytest.approx(rewards[0])
 
 
+def test_the_episodes_of_one_robot_are_those_of_the_first_of_many(project: Path) -> None:
+    one, many = gymnasium.make(romnav.gym.ID, project=project), vector(project, 2)
+    a, b = one.reset(seed=3)[0], many.reset(seed=3)[0]
+    for _ in range(25):  # an episode has ten steps
+        np.testing.assert_array_equal(a["state"], b["state"][0])
+        a, _, ended, truncated, _ = one.step(np.zeros(3, np.float32))
+        b, *_ = many.step(np.zeros((2, 3), np.float32))
+        if ended or truncated:
+            a, _ = one.reset()
+
+
+def test_the_share_of_the_run_sets_the_weights_that_switch(project: Path) -> None:
+    rewards = []
+    for progress in (0.0, 1.0):
+        env = vector(project, 2)
+        env.unwrapped.progress = progress
+        env.reset(seed=3)
+        rewards.append(env.step(np.ones((2, 3), np.float32))[1])
+    assert (rewards[1] < rewards[0]).all()  # a change of the command costs more
+
+
 def test_an_arm_brings_its_settings(project: Path) -> None:
     env = vector(project, 1, arm="uniform")
     assert env.unwrapped._env.spec.sampler.stair_probability == 0.0

@@ -19,7 +19,7 @@ from romnav.navigation.observations import observe
 from romnav.navigation.ppo import make_actor, make_ppo
 from romnav.navigation.spec import EncoderUseSpec, KickstartSpec, NavigationSpec, Schedule
 from romnav.robot.rom import ReducedOrderModel
-from romnav.world.world import World
+from romnav.world.world import LEVEL_GAP, World
 
 from .conftest import TOKENS, FakePerception, fake_encoder
 
@@ -261,7 +261,9 @@ def test_teachers_that_do_not_fit_are_refused(
 def test_places_of_the_robots(world: World, spec: NavigationSpec) -> None:
     env = NavigationEnv(world, ReducedOrderModel(world, 12, 0.2), FakePerception(), spec.env, 1, "cpu")
     cross, stairs = env.places().T
-    assert torch.equal(cross, env._cross)
+    climb = env._goal_position[:, 2] - env.dynamics.position[:, 2]  # nobody has moved yet
+    assert torch.equal(cross, climb.abs() > LEVEL_GAP)
+    assert 0 < cross.sum() < 12
     for k in range(12):
         grid = world.grids[int(env.dynamics.tile[k])]
         near = (grid.position[:, :2] - env.dynamics.position[k, :2].numpy()).__abs__().max(axis=1) < 0.1

@@ -138,6 +138,8 @@ def test_a_run_that_begins_with_a_policy_resumes_exactly(
     with pytest.raises(Stopped):
         train.train(spec, world, perception, tmp_path / "half", 2, begin=first, progress=stop)
     with pytest.raises(RomnavError, match="another begin"):
+        train.train(spec, world, perception, tmp_path / "half", 2)
+    with pytest.raises(RomnavError, match="another begin"):
         train.train(spec, world, perception, tmp_path / "half", 2, begin=tmp_path / "whole" / "policy.pt")
     train.train(spec, world, perception, tmp_path / "half", 2, begin=first)
     assert_same(weights(tmp_path / "whole"), weights(tmp_path / "half"))

@@ -27,8 +27,8 @@ COLUMNS = (
     *(f"sr_{horizon}_{level}" for horizon in (45, 120) for level in (*LEVELS, "storey")),
     *("spl", "t2g"),
 )
-"""Digests of the policy and of what it was judged by, place in the run, success rates in percent by level and over climbs of a storey
-or more, SPL, and time to goal in s."""
+"""Digests of the policy and of what it was judged by, place in the run, success rates in percent by level and over
+climbs of a storey or more, SPL, and time to goal in s."""
 
 
 def judge(

@@ -155,7 +155,7 @@ def _make(stage: Stage, session: Session) -> None:
 
 
 def start_over(stages: Iterable[Stage], say: Callable[[str], None]) -> None:
-    """Drops what there is of the runs of stages before they are executed elsewhere; runs with other settings are kept."""
+    """Drops what there is of the runs of stages before they are executed elsewhere; runs with other settings stay."""
     for stage in stages:
         with _locked(stage, say):
             records.retrieve(stage)

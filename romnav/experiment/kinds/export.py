@@ -66,6 +66,7 @@ def _export(driven: Driven, trained: Stage, stage: Stage, session: Session, prog
         commit=records.commit(),
         period=env.period,
         command=env.command,
+        stair_limits=settings.navigation.stair_limits,
         max_goal_distance=env.max_goal_distance,
         lidar=settings.lidar,
         depth=settings.depth if actor.depth else None,

@@ -81,7 +81,7 @@ def _curves(work: Workspace, notes: list[str]) -> dict[str, tuple[list[Curves], 
             ended = curves.read(work, experiment, done)
             drawn = experiment.declared(name, {"curves"}).tables if done else ()
             made = [curves.tabulate(work, name, table, ended, done) for table in drawn]
-            # the seeds of an arm make one curve, for which those that still train are too short: one of them stands alone
+            # the seeds of an arm make one curve, for which those that still train are too short: one may stand alone
             alone = {run.arm: run for run in reversed(runs) if run.arm not in ended}
             curved = [run for run in runs if run in done or run is alone.get(run.arm)]
             arms = curves.read(work, experiment, curved)

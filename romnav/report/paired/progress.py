@@ -53,7 +53,7 @@ def read(path: Path) -> pd.DataFrame:
 
 
 def draw(arms: Mapping[str, Sequence[pd.DataFrame]], path: Path) -> None:
-    """Draw success against steps and hours of every arm, a line a training seed, with its gain per doubling of the steps.
+    """Draw success against steps and hours of every arm, a line for each seed, with its gain per doubling of the steps.
 
     Args:
         arms: Rows of ``kept.csv``, one table a training seed, by label.

@@ -73,7 +73,9 @@ def test_the_first_failure_names_its_reason() -> None:
 
 def test_a_failure_stops_what_began_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    (tmp_path / "python").write_text('#!/bin/sh\n[ "$3" = endless ] && exec sleep 300\necho "error: cannot" >&2; exit 1\n')
+    (tmp_path / "python").write_text(
+        '#!/bin/sh\n[ "$3" = endless ] && exec sleep 300\necho "error: cannot" >&2; exit 1\n'
+    )
     (tmp_path / "python").chmod(0o755)
     started = time.monotonic()
     with pytest.raises(RomnavError, match="cannot"):

@@ -478,7 +478,8 @@ def test_a_stage_that_was_killed_while_made_again_is_made_again(chain: list[Stag
     with pytest.raises(KeyboardInterrupt):  # so does one that changed settings; its old record stands
         execute([replace(chain[1], make=die, settings=Settings(b=1))], Session())
     old = records.read(chain[1])
-    assert old is not None and old.key == chain[1].key
+    assert old is not None
+    assert old.key == chain[1].key
 
 
 def test_starting_over_keeps_runs_with_other_settings(resumable: Callable[[Settings], Stage]) -> None:
