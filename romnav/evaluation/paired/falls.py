@@ -10,13 +10,13 @@ from torch import Tensor
 
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.paired.run import run
-from romnav.evaluation.rollout import Driver
+from romnav.evaluation.rollout import Driver, View
 from romnav.evaluation.spec import EvaluationSpec
+from romnav.evaluation.tracks import Recorder
 from romnav.navigation.spec import EnvSpec
 from romnav.progress import Progress
 from romnav.robot.dynamics import Body, Dynamics
 from romnav.world.solids import Label
-from romnav.world.spawns import Start
 from romnav.world.world import LEVEL_GAP, World
 
 PLACES = ("flat", "stair up", "stair down", "ramp", "at a wall", "on a landing")
@@ -25,60 +25,52 @@ NEAR_WALL = 2.0
 """Time for which a robot that touched something counts as at a wall, s."""
 
 
-class Tally:
-    """Robots whose way and falls are counted by place; otherwise those that `body` makes.
+class Tally(Recorder):
+    """Counts way and falls of running episodes by the place where a command began.
 
     Attributes:
         way: (places,) m.
         falls: (places,).
     """
 
-    def __init__(self, body: Body, world: World, robots: int, period: float) -> None:
-        self._robot: Dynamics = body(world, robots, period)
+    def __init__(self, world: World, episodes: int, period: float) -> None:
+        super().__init__()
         self._world, self._memory = world, round(NEAR_WALL / period)
         self._landings = _landings(world)
-        self._touched = torch.full((robots,), self._memory)
-        self._height = torch.zeros(robots)
+        self._touched = torch.full((episodes,), self._memory)
+        self._height = torch.zeros(episodes)
+        self._position = torch.zeros(episodes, 3)
+        self._fallen = torch.zeros(episodes, dtype=torch.bool)
+        self._at = torch.zeros(episodes, dtype=torch.long)
         self.way, self.falls = np.zeros(len(PLACES)), np.zeros(len(PLACES), int)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._robot, name)
+    def add(self, view: View, alive: Tensor) -> None:
+        """Count the period that ends here, of the rows ``alive`` (A,)."""
+        robot, e = view.robot, view.episode
+        if view.step == 0:
+            self._height[e] = robot.position[:, 2]
+        else:
+            before, fallen, place = self._position[e], self._fallen[e], self._at[e]
+            # a body that lies at a wall touches it too: only contacts of those that stand are remembered
+            self._touched[e] = torch.where((robot.contacts > 0) & ~robot.fallen, 0, self._touched[e] + 1)
+            self._height[e] = 0.8 * self._height[e] + 0.2 * before[:, 2]
+            way = torch.linalg.vector_norm(robot.position[:, :2] - before[:, :2], dim=1)
+            walked, fell = alive & ~fallen, alive & robot.fallen & ~fallen
+            self.way += np.bincount(place[walked].numpy(), way[walked].double().numpy(), len(PLACES))
+            self.falls += np.bincount(place[fell].numpy(), minlength=len(PLACES))
+        self._position[e], self._fallen[e] = robot.position, robot.fallen
+        self._at[e] = self._place(robot, e)
 
-    def reset(self, envs: Tensor, start: Start) -> None:
-        """Put the robots ``envs`` (K,) at their starts."""
-        self._robot.reset(envs, start)
-        self._touched[envs] = self._memory
-        self._height[envs] = self._robot.position[envs, 2]
-
-    def select(self, envs: Tensor) -> None:
-        """Keep only the robots ``envs`` (K,), in that order."""
-        self._robot.select(envs)
-        self._touched, self._height = self._touched[envs], self._height[envs]
-
-    def step(self, command: Tensor) -> None:
-        """Track the command (E, 3) for one period, and count it where it began."""
-        r = self._robot
-        before, fallen, place = r.position.clone(), r.fallen.clone(), self._place()
-        r.step(command)
-        # a body that lies at a wall touches it too: only contacts of those that stand are remembered
-        self._touched = torch.where((r.contacts > 0) & ~r.fallen, 0, self._touched + 1)
-        self._height = 0.8 * self._height + 0.2 * before[:, 2]
-        way = torch.where(fallen, 0.0, torch.linalg.vector_norm(r.position[:, :2] - before[:, :2], dim=1))
-        fell = r.fallen & ~fallen
-        self.way += np.bincount(place.numpy(), way.double().numpy(), len(PLACES))
-        self.falls += np.bincount(place[fell].numpy(), minlength=len(PLACES))
-
-    def _place(self) -> Tensor:
-        """(E,) index in `PLACES` of where robots are."""
-        r, world = self._robot, self._world
-        cell = world.index(r.position[:, :2])
-        at = r.tile, r.layer, cell[:, 0], cell[:, 1]
+    def _place(self, robot: Dynamics, episode: Tensor) -> Tensor:
+        """(A,) index in `PLACES` of where the robots of episodes (A,) are."""
+        cell = self._world.index(robot.position[:, :2])
+        at = robot.tile, robot.layer, cell[:, 0], cell[:, 1]
         kind, landing = (grid[at] for grid in self._landings)
         place = torch.zeros_like(kind)
-        rising = r.position[:, 2] >= self._height
+        rising = robot.position[:, 2] >= self._height[episode]
         place = torch.where(kind == Label.STAIR, torch.where(rising, 1, 2), place)
         place = torch.where(kind == Label.RAMP, 3, place)
-        place = torch.where(self._touched < self._memory, 4, place)
+        place = torch.where(self._touched[episode] < self._memory, 4, place)
         return torch.where(landing & (place == 0), 5, place)
 
 
@@ -119,15 +111,9 @@ def count(
         A row for each place, and one for "all": `driver`, `place`, `episodes`, `fell` (falls there over episodes),
         `falls_per_100m` (null where nobody went), `way`, m; "all" has `sr_45` and `sr_120`, shares.
     """
-    made: list[Tally] = []
-
-    def tallied(world: World, robots: int, period: float) -> Tally:
-        made.append(Tally(body, world, robots, period))
-        return made[0]
-
-    columns = run(driver, world, episodes, env, spec, progress, tallied)
-    (tally,) = made
     n = len(episodes)
+    tally = Tally(world, n, env.period)
+    columns = run(driver, world, episodes, env, spec, progress, body, tally)
 
     def row(place: str, falls: int, way: float) -> dict[str, Any]:
         rate = 100.0 * falls / way if way > 0 else None

@@ -109,7 +109,7 @@ class Driven:
         return rollout.Policy(checkpoint.load_actor(path, seen.encoder, device, depth_encoder=depth), seen)
 
     def provenance(self, stage: Stage, starts: str, spec: EvaluationSpec | TrialSpec) -> Provenance:
-        """Where the rows of a stage that is about to be made come from; ``starts`` is the hash of initial conditions."""
+        """Where the rows that a stage is about to make come from; ``starts`` is the hash of the initial conditions."""
         from romnav.evaluation.rowfile import Provenance
 
         facts: dict[str, Any] = {"steps": 0, "hours": 0.0}

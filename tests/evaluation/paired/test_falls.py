@@ -66,9 +66,9 @@ def test_places_add_up_to_all(counted: tuple[list[dict], Stumbling]) -> None:
     assert sum(row["fell"] for row in places) == pytest.approx(whole["fell"])
     assert 0.2 < whole["fell"] < 0.9
     assert 0.0 < whole["sr_45"] <= whole["sr_120"] < 1.0 - whole["fell"] + 1e-9
-    # who has arrived walks on until the batch is made smaller, and does so at no place of the test
-    assert sum(row["way"] for row in places) >= whole["way"] * 0.999
-    assert sum(row["way"] for row in places) <= robots.total.sum().item() * 1.001
+    # who has arrived walks on until the batch is made smaller, which counts nowhere
+    assert sum(row["way"] for row in places) == pytest.approx(whole["way"])
+    assert whole["way"] < robots.total.sum().item()
 
 
 def test_falls_on_stairs_are_counted_there(counted: tuple[list[dict], Stumbling]) -> None:
