@@ -7,8 +7,8 @@ A quoted number stands between two comments, of which the first tells where it c
     <!-- = results/cpu/tables/safety.csv "In-Distribution, CBF" collision .3g -->0<!-- -->
 
 A key of JSON leads through objects by name and through lists by a field that has a value or by position; several keys
-are added up. A row and a column lead to our first number in a table's CSV. The last word formats the number, times a
-factor if it begins so. A whole table is
+are added up. A row and a column lead to our number in a table's CSV; where blocks of it have the same rows, a third key is
+part of the block's title. The last word formats the number, times a factor if it begins so. A whole table is
 
     <!-- = results/cpu/tables/safety.md -->
     <!-- -->
@@ -81,12 +81,16 @@ def _at(found: Any, keys: str) -> float:
     return float(found)
 
 
-def _of_csv(path: Path, row: str, column: str) -> float:
+def _of_csv(path: Path, row: str, column: str, block: str = "") -> float:
     with path.open(encoding="utf-8") as file:
-        for line in csv.DictReader(file):
-            if (line["source"], line["row"], line["column"]) == ("ours", row, column):
-                return float(line["value"])
-    raise KeyError(f"no {row}, {column}")
+        found = {
+            line["block"]: float(line["value"])
+            for line in csv.DictReader(file)
+            if (line["source"], line["row"], line["column"]) == ("ours", row, column) and block in line["block"]
+        }
+    if len(found) != 1:
+        raise KeyError(f"{row}, {column} is in {'; '.join(found) or 'no block'}; name one of them")
+    return found.popitem()[1]
 
 
 def _kept(scale: str) -> str:

@@ -174,11 +174,11 @@ def to_csv(table: Table) -> str:
     """One line per number, unrounded, with its facts and provenance; empty where there are none."""
     text = io.StringIO()
     facts = dict.fromkeys(f for block in table.blocks for row in block.rows for c in row.cells for f in c.facts)
-    head = ["table", "source", "row", "column", "value", *facts, "bold", "dagger", *table.provenance]
+    head = ["table", "source", "block", "row", "column", "value", *facts, "bold", "dagger", *table.provenance]
     out = csv.DictWriter(text, head, lineterminator="\n")
     out.writeheader()
     for block in table.blocks:
-        origin = {"table": table.name, "source": block.source}
+        origin = {"table": table.name, "source": block.source, "block": block.title}
         if block.source == "ours":
             origin |= table.provenance
         for row in block.rows:

@@ -75,7 +75,10 @@ def test_deploy_has_a_row_for_each_filter_and_the_lengths_of_the_paper(trial_run
 
 
 def test_all_formats_hold_the_numbers(trial_run, scenes) -> None:
-    table = trial_tables.safety([trial_run("rom", n=64)], scenes, LABELS)
+    runs = [trial_run("rom", n=64), trial_run("oracle", n=64)]
+    both = list(csv.DictReader(io.StringIO(formats.to_csv(trial_tables.safety(runs, scenes, LABELS)))))
+    assert len({(r["block"], r["row"], r["column"]) for r in both}) == len(both)
+    table = trial_tables.safety(runs[:1], scenes, LABELS)
     assert {block.source for block in table.blocks} == {"ours"}
     text = formats.latex(table)
     assert r"$\pm$" in text
