@@ -21,14 +21,16 @@ def test_numbers_are_read_from_json_csv_and_tables(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(numbers, "ROOT", tmp_path)
     (tmp_path / "a.json").write_text(json.dumps({"of": [{"name": "x", "rate": 0.985}, {"name": "y", "rate": 1.0}]}))
     (tmp_path / "t.csv").write_text(
-        'source,block,row,column,value\npaper,,R,c,1\nours,"A, 0","R, on",c,2.25\nours,"B, 0","R, on",c,9\nours,,S,c,4\n'
+        'source,block,row,column,value\npaper,,R,c,1\nours,"A, 0","R, on",c,2.25\n'
+        'ours,"B, 0","R, on",c,9\nours,,S,c,4\n'
     )
     (tmp_path / "t.md").write_text("| a |\n|---|\n| 1 |\n")
     (tmp_path / "b.json").write_text(json.dumps({"shares": {"one part": 0.25, "two": 0.125}, "ends": [-1.5, 0.5]}))
     page = (
         'Sum <!-- = b.json "shares/one part" shares/two 1000*,.0f --><!-- -->, <!-- = b.json ends/0 +.1f --><!-- -->. '
         "Rates of <!-- = a.json of/name=x/rate 100*.3g -->?<!-- --> and <!-- = a.json of/name=y/rate .1f --><!-- -->, "
-        'or <!-- = t.csv "R, on" c "A, 0" .1f -->7<!-- -->, <!-- = t.csv S c .1f --><!-- -->.\n<!-- = t.md -->\nold\n<!-- -->\n'
+        'or <!-- = t.csv "R, on" c "A, 0" .1f -->7<!-- -->, <!-- = t.csv S c .1f --><!-- -->.\n'
+        "<!-- = t.md -->\nold\n<!-- -->\n"
     )
     text = numbers.written(page)
     assert "rate 100*.3g -->98.5<!-- -->" in text

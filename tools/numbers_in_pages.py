@@ -7,8 +7,8 @@ A quoted number stands between two comments, of which the first tells where it c
     <!-- = results/cpu/tables/safety.csv "In-Distribution, CBF" collision .3g -->0<!-- -->
 
 A key of JSON leads through objects by name and through lists by a field that has a value or by position; several keys
-are added up. A row and a column lead to our number in a table's CSV; where blocks of it have the same rows, a third key is
-part of the block's title. The last word formats the number, times a factor if it begins so. A whole table is
+are added up. A row and a column lead to our number in a table's CSV; where blocks of it have the same rows, a third key
+is part of the block's title. The last word formats the number, times a factor if it begins so. A whole table is
 
     <!-- = results/cpu/tables/safety.md -->
     <!-- -->

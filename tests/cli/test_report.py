@@ -18,6 +18,16 @@ def test_tables_of_what_is_there_and_notes_of_what_is_not(evaluated: Path) -> No
     assert str(evaluated) not in text
 
 
+def test_what_lies_among_results_and_is_none_is_noted(evaluated: Path) -> None:
+    for name in ("gone/seed-0", "rom/seed-0-old"):
+        (evaluated / "results" / "smoke" / name).mkdir(parents=True)
+        (evaluated / "results" / "smoke" / name / "episodes.parquet").touch()
+    result = romnav("report")
+    assert result.exit_code == 0, result.output
+    assert "no episodes of results/smoke/gone/seed-0: no arm and training seed" in result.stderr
+    assert "no episodes of results/smoke/rom/seed-0-old: no arm and training seed" in result.stderr
+
+
 def test_mistakes_are_one_line(project: Path, evaluated: Path) -> None:
     assert "nothing is recorded; run `romnav run ablation" in fails("report", "--scale", "paper")
     assert "no such file of rows" in fails("report", "single-stage")

@@ -64,6 +64,7 @@ from tests.fuzz import FILE, leaves, nested
         ("locomotion.tiles.drivers", {"oracle": 1.0}),
         ("evaluation.episodes", "../secret"),
         ("evaluation.duration", -1.0),
+        ("evaluation.duration", 121.0),
         ("safety.filter.occupancy.radius", 0.01),
         ("safety.filter.occupancy.size", 1.0),
         ("deploy.reach", 0.0),

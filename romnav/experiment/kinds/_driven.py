@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from romnav.robot.dynamics import Body
     from romnav.world.world import World
 
-NOISE = 1
-"""Seed of the sensor noise in evaluation: every arm meets the same noise in the same step of an episode."""
+NOISE, GUARD_NOISE = 1, 1000
+"""Seeds of the sensor noise in evaluation, the policy's and the safety filter's: every arm meets the same noise in the
+same step of an episode."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,9 @@ class Driven:
         from romnav.evaluation.shield import Guarded
 
         arms = settings.locomotion.robot if settings.navigation.dynamics == "g1" else None
-        return partial(Guarded, made, settings.safety, settings.navigation.env, arms)
+        # `safety.seed` is of the trials: episodes have a noise of their own, which no setting changes
+        guard = settings.safety.model_copy(update={"seed": GUARD_NOISE})
+        return partial(Guarded, made, guard, settings.navigation.env, arms)
 
     def driver(self, world: World, device: str) -> Driver:
         """What commands the robots."""

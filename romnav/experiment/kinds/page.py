@@ -98,9 +98,9 @@ def _galleries(work: Workspace, arms: Sequence[str], notes: list[str]) -> dict[s
     """Episodes by arm, and by training seed where an arm has several."""
     places = []
     for file in sorted(work.folder.glob("*/seed-*/episodes.parquet")):
-        arm, seed = file.parts[-3], file.parts[-2].removeprefix("seed-")
-        if seed.isdecimal() and (arm in work.project.arms or arm in SCRIPTED):
-            places.append((arm, int(seed)))
+        arm, number = file.parts[-3], file.parts[-2].removeprefix("seed-")
+        if number.isdecimal() and arm in work.project.arms:
+            places.append((arm, int(number)))
         else:
             notes.append(f"no episodes of {file.parent}: no arm and training seed of an experiment")
     places.sort(key=lambda place: work.project.driver(place[0]) in SCRIPTED)

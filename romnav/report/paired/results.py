@@ -11,6 +11,7 @@ from typing import Any
 from romnav.errors import NothingRecorded, RomnavError
 from romnav.evaluation.paired import metrics, rows
 from romnav.evaluation.paired.statistics import Bootstrap
+from romnav.evaluation.spec import HORIZONS
 
 ROWS_FILE = "episodes.parquet"
 
@@ -66,7 +67,7 @@ def collect(results_dir: Path, scale: str, runs: Collection[Run] | None = None) 
         "contrasts": [
             _contrast(bootstrap, by_tile, a.name, b.name, horizon, level)
             for a, b in permutations(arms, 2)
-            for horizon in rows.HORIZONS
+            for horizon in HORIZONS
             for level in metrics.LEVELS
         ],
     }

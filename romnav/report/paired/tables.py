@@ -11,8 +11,8 @@ from typing import Any
 
 from romnav.errors import NothingRecorded
 from romnav.evaluation.paired.metrics import LEVELS, METRICS, Direction, Metric, find, split
-from romnav.evaluation.paired.rows import HORIZONS
 from romnav.evaluation.paired.statistics import Bootstrap
+from romnav.evaluation.spec import HORIZONS
 from romnav.report.formats import Block, Cell, Row, Table, number
 from romnav.report.provenance import distinct, source, sources, training
 from romnav.report.spec import Column, Entry, Published, TableKind, TableSpec

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from romnav.evaluation.paired import metrics, rows
+from romnav.evaluation.spec import HORIZONS
 
 
 def columns(**changes: object) -> dict[str, np.ndarray]:
@@ -101,4 +102,4 @@ def test_bounds_and_order(n: int, seed: int, skill: float) -> None:
 def test_every_metric_names_known_quantities() -> None:
     known = metrics.quantities(columns())
     assert all({m.numerator, m.denominator} <= set(known) for m in metrics.METRICS.values())
-    assert {f"sr_{h}" for h in rows.HORIZONS} <= set(metrics.METRICS)
+    assert {f"sr_{h}" for h in HORIZONS} <= set(metrics.METRICS)

@@ -5,13 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from romnav.evaluation import episodes
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.paired import run as paired_run
 from romnav.evaluation.paired.run import run
-from romnav.evaluation.rollout import Driver, Oracle, Policy, Straight, View
+from romnav.evaluation.rollout import Driver, Oracle, Policy, Straight, View, step_limit
 from romnav.evaluation.spec import EpisodeSetSpec, EvaluationSpec
 from romnav.navigation.ppo import make_actor
 from romnav.navigation.spec import EnvSpec, PolicySpec
@@ -131,3 +133,15 @@ def test_measures_of_a_robot_that_stands_still(world: World, paired: EpisodeSet)
     assert (out["path_length"] == 0.0).all()
     assert (out["collisions"] == 0).all()
     np.testing.assert_allclose(out["final_distance"], paired.columns["geodesic"], atol=0.2 * 2**0.5)
+
+
+@given(duration=st.floats(1.0, 120.0), period=st.floats(0.05, 1.0))
+def test_an_episode_has_as_many_steps_as_fit(duration: float, period: float) -> None:
+    steps = step_limit(duration, period)
+    assert steps * period <= duration * (1 + 1e-5)
+    assert (steps + 1) * period > duration * (1 - 1e-5)
+
+
+def test_steps_that_fit_exactly_are_all_there() -> None:
+    periods = {0.1: 1200, 0.2: 600, 0.35: 342, 0.3: 400}
+    assert {period: step_limit(120.0, period) for period in periods} == periods

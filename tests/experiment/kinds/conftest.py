@@ -23,11 +23,11 @@ ROOT = Path(__file__).parents[3]
 SCALE = """
 [world]
 tiles = 4
-[evaluation]
-duration = 4.0
 [navigation.policy]
 attention = 16
 recurrent = 16
+[evaluation]
+duration = 4.0
 """
 
 

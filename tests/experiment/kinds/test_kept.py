@@ -16,7 +16,8 @@ from romnav.experiment.kinds import policy as policies
 from romnav.experiment.kinds.kept import elsewhere, kept, reports
 from romnav.experiment.workspace import Workspace
 from romnav.report.paired import progress
-from tests.experiment.kinds.conftest import policy
+from tests.experiment import conftest
+from tests.experiment.kinds.conftest import SCALE, policy
 from tests.navigation.conftest import FakePerception
 
 
@@ -38,6 +39,8 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     first = kept(work, "rom", 0)
     first.make(first, Session(), progress)
     once = len(walked)
+    (row,) = read(folder / "kept.csv")
+    assert (row["iteration"], row["steps"]) == ("2", "100")
     assert once > 0
     (folder / "kept" / "000002.pt").unlink()
     policy(folder / "kept" / "000004.pt", work, 2)
@@ -47,6 +50,7 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     assert not elsewhere(run)
     second.make(second, Session(), progress)
     assert len(walked) == 2 * once
+    assert [row["iteration"] for row in read(folder / "kept.csv")] == ["2", "4"]
     second.make(second, Session(), progress)
     assert len(walked) == 2 * once
     policy(folder / "kept" / "000004.pt", work, 3)  # as a run makes it that was killed and went on
@@ -56,6 +60,12 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     policy(folder / "kept" / "000004.pt", work, 2)
     second.make(second, Session(), progress)
     assert len(walked) == 4 * once
+    second.make(second, Session(resume=False), progress)
+    assert len(walked) == 5 * once
+    assert [row["iteration"] for row in read(folder / "kept.csv")] == ["4"]
+    farther = kept(conftest.workspace(work.project.root, SCALE + "reach = 0.6\n"), "rom", 0)
+    farther.make(farther, Session(), progress)
+    assert len(walked) == 6 * once
     (figure,) = reports(work, "spawn-goal", [0])
     assert not reports(work, "deploy", [0])  # it drives the same arm, but trains none
     assert [path.parts[-3:-1] for path in figure.reads] == [("rom", "seed-0")]
@@ -64,7 +74,7 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     (folder / "kept" / "000004.pt").unlink()
     assert elsewhere(run)
     rows = read(folder / "kept.csv")
-    assert [(row["iteration"], row["steps"]) for row in rows] == [("2", "100"), ("4", "200")]
+    assert [(row["iteration"], row["steps"]) for row in rows] == [("4", "200")]
     for row in rows:
         for level in ("all", "same", "cross", "storey"):
             assert 0.0 <= float(row[f"sr_45_{level}"]) <= float(row[f"sr_120_{level}"]) <= 100.0
