@@ -59,14 +59,15 @@ def kept(work: Workspace, arm: str, seed: int) -> Stage:
 
 
 def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
-    """The progress of the trained arms of an ablation, as a figure, where any was judged along its run."""
+    """The progress of the trained arms of an ablation, as a figure, where any was judged along its run: of every seed
+    that was, asked for or not."""
     experiment = work.project.experiment(name)
     if experiment.kind != "ablation":
         return []
     judged = {
         label: tuple(
             (path, _begun(work, arm, seed))
-            for seed in seeds
+            for seed in sorted({*seeds, *_seeds(work, arm)})
             if (path := work.folder / arm / f"seed-{seed}" / "kept.csv").exists()
         )
         for arm, label in experiment.labels.items()
@@ -92,6 +93,12 @@ def reports(work: Workspace, name: str, seeds: Sequence[int]) -> list[Stage]:
             ),
         )
     ]
+
+
+def _seeds(work: Workspace, arm: str) -> list[int]:
+    """Training seeds that an arm has results of."""
+    numbers = [path.name.removeprefix("seed-") for path in (work.folder / arm).glob("seed-*")]
+    return [int(number) for number in numbers if number.isdecimal()]
 
 
 def _begun(work: Workspace, arm: str, seed: int) -> tuple[Stage, ...]:

@@ -107,11 +107,13 @@ def test_what_a_run_begins_with_is_counted(work: Workspace, monkeypatch: pytest.
         for name in stage.outputs:
             (stage.folder / name).write_text("made")
         records.finish(stage, record, None, {"steps": steps, "hours": 1.0}, 0.0)
+    (work.folder / "rom" / "seed-3").mkdir()
+    (work.folder / "rom" / "seed-3" / "kept.csv").write_text("steps,hours,sr_120_all\n100,0.1,50.0\n")
     (figure,) = reports(work, "on", [0])
     figure.make(figure, Session(), lambda done, total, text: None)
-    assert {label: list(rows["steps"]) for label, (rows,) in drawn.items()} == {
-        "RoM": [250.0, 500.0],
-        "on": [650.0, 800.0],
-        "on and on": [850.0, 900.0],
+    assert {label: [list(rows["steps"]) for rows in runs] for label, runs in drawn.items()} == {
+        "RoM": [[250.0, 500.0], [100.0]],
+        "on": [[650.0, 800.0]],
+        "on and on": [[850.0, 900.0]],
     }
     assert list(drawn["on and on"][0]["hours"]) == [2.5, 3.0]
