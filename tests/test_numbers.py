@@ -20,23 +20,23 @@ def test_every_quoted_number_is_that_of_the_results() -> None:
 def test_numbers_are_read_from_json_csv_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numbers, "ROOT", tmp_path)
     (tmp_path / "a.json").write_text(json.dumps({"of": [{"name": "x", "rate": 0.985}, {"name": "y", "rate": 1.0}]}))
-    (tmp_path / "t.csv").write_text(
-        'source,block,row,column,value\npaper,,R,c,1\nours,"A, 0","R, on",c,2.25\n'
-        'ours,"B, 0","R, on",c,9\nours,,S,c,4\n'
-    )
+    rows = 'paper,,R,c,1,0\nours,"A, 0","R, on",c,2.25,0\nours,"B, 0","R, on",c,9,1\nours,,S,c,-9,1\n'
+    (tmp_path / "t.csv").write_text(f"source,block,row,column,value,dagger\n{rows}")
     (tmp_path / "t.md").write_text("| a |\n|---|\n| 1 |\n")
     (tmp_path / "b.json").write_text(json.dumps({"shares": {"one part": 0.25, "two": 0.125}, "ends": [-1.5, 0.5]}))
     page = (
         'Sum <!-- = b.json "shares/one part" shares/two 1000*,.0f --><!-- -->, <!-- = b.json ends/0 +.1f --><!-- -->. '
         "Rates of <!-- = a.json of/name=x/rate 100*.3g -->?<!-- --> and <!-- = a.json of/name=y/rate .1f --><!-- -->, "
-        'or <!-- = t.csv "R, on" c "A, 0" .1f -->7<!-- -->, <!-- = t.csv S c .1f --><!-- -->.\n'
-        "<!-- = t.md -->\nold\n<!-- -->\n"
+        'or <!-- = t.csv "R, on" c "A, 0" .1f -->7<!-- -->, <!-- = t.csv "R, on" c "A, 0" +.1f† --><!-- -->, '
+        "<!-- = t.csv S c 2*+.1f† --><!-- -->.\n<!-- = t.md -->\nold\n<!-- -->\n"
     )
     text = numbers.written(page)
     assert "rate 100*.3g -->98.5<!-- -->" in text
     assert "1000*,.0f -->375<!-- -->, <!-- = b.json ends/0 +.1f -->-1.5<!-- -->." in text
     assert "rate .1f -->1.0<!-- -->," in text
-    assert '"A, 0" .1f -->2.2<!-- -->, <!-- = t.csv S c .1f -->4.0<!-- -->.' in text
+    assert 'c "A, 0" .1f -->2.2<!-- -->, ' in text
+    assert 'c "A, 0" +.1f† -->+2.2<!-- -->, ' in text
+    assert "c 2*+.1f† -->-18.0†<!-- -->." in text
     with pytest.raises(numbers.SourceError, match="R, on, c is in A, 0; B, 0; name one of them"):
         numbers.value('t.csv "R, on" c .1f')
     assert "\n\n| a |\n|---|\n| 1 |\n\n<!-- -->" in text

@@ -8,7 +8,8 @@ A quoted number stands between two comments, of which the first tells where it c
 
 A key of JSON leads through objects by name and through lists by a field that has a value or by position; several keys
 are added up. A row and a column lead to our number in a table's CSV; where blocks of it have the same rows, a third key
-is part of the block's title. The last word formats the number, times a factor if it begins so. A whole table is
+is part of the block's title. The last word formats the number, times a factor if it begins so. If it ends in †, one
+follows the number where the table has one. A whole table is
 
     <!-- = results/cpu/tables/safety.md -->
     <!-- -->
@@ -59,16 +60,16 @@ def value(source: str) -> str:
         if path.suffix == ".md":
             return f"\n\n{path.read_text('utf-8').strip()}\n\n"
         *keys, form = keys
-        number = {".json": _of_json, ".csv": _of_csv}[path.suffix](path, *keys)
-        factor, _, form = form.rpartition("*")
-        return f"{number * float(factor or 1):{form}}"
+        number, dagger = {".json": _of_json, ".csv": _of_csv}[path.suffix](path, *keys)
+        factor, _, plain = form.removesuffix("†").rpartition("*")
+        return f"{number * float(factor or 1):{plain}}" + "†" * (dagger and form.endswith("†"))
     except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
         raise SourceError(f"{source}: {error}") from error
 
 
-def _of_json(path: Path, *keys: str) -> float:
+def _of_json(path: Path, *keys: str) -> tuple[float, bool]:
     content = json.loads(path.read_text("utf-8"))
-    return sum([_at(content, key) for key in keys])
+    return sum([_at(content, key) for key in keys]), False
 
 
 def _at(found: Any, keys: str) -> float:
@@ -81,10 +82,10 @@ def _at(found: Any, keys: str) -> float:
     return float(found)
 
 
-def _of_csv(path: Path, row: str, column: str, block: str = "") -> float:
+def _of_csv(path: Path, row: str, column: str, block: str = "") -> tuple[float, bool]:
     with path.open(encoding="utf-8") as file:
         found = {
-            line["block"]: float(line["value"])
+            line["block"]: (float(line["value"]), line["dagger"] == "1")
             for line in csv.DictReader(file)
             if (line["source"], line["row"], line["column"]) == ("ours", row, column) and block in line["block"]
         }

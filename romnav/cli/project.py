@@ -20,7 +20,10 @@ def init(
     from romnav.experiment import template
 
     template.init(folder)
-    typer.echo(f"{folder}: a project; there, run `romnav list`, or copy experiments/spawn-goal.toml and change a line")
+    typer.echo(
+        f"{folder}: a project; there, run `romnav list`, or copy experiments/spawn-goal.toml, rename its tables and "
+        "the arms that you change, and run it"
+    )
 
 
 @command(app, "list")
