@@ -178,7 +178,8 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
 
     Returns:
         Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
-        no arm, or gives another arm or table a name of one before it. They do not take the others down.
+        no arm, or gives an arm or table a name that another one has in another file, which is refused, too, since it
+        is not known which of them is meant. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
     read: dict[str, Experiment] = {}
@@ -192,33 +193,42 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
     whole = not wrong  # an arm that is missed may be in what could not be read
     experiments: dict[str, Experiment] = {}
     for name, experiment in read.items():
-        if fault := _fault(name, experiment, experiments, known, drivers if whole else None):
+        if fault := _fault(experiment, known, drivers if whole else None) or _clash(name, read):
             wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
         else:
             experiments[name] = experiment
     return experiments, wrong
 
 
-def _fault(
-    name: str, experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
-) -> str | None:
-    """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
+def _fault(experiment: Experiment, scales: set[str], drivers: set[str] | None) -> str | None:
+    """What of an experiment does not fit scales, and drivers if they are known."""
     for scale in experiment.scales.keys() - scales:
         return f"scales: unknown scale {scale}{suggest(scale, scales)}"
-    every = get_args(TableKind)
-    for table in experiment.declared(name, every).tables:
-        for first, other in before.items():
-            if table in other.declared(first, every).tables:
-                return f"tables.{table}: {first}.toml has a table of this name; rename one"
-    for arm_name, arm in experiment.arms.items():
+    for name, arm in experiment.arms.items():
         if arm.policy and drivers is not None and arm.policy not in drivers:
-            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
-        for first, other in before.items():
-            same = other.arms.get(arm_name)
-            unlike = same and same.model_dump(exclude={"label"}) != arm.model_dump(exclude={"label"})
-            if same and (unlike or other.scales != experiment.scales):
-                return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
+            return f"arms.{name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
     return None
+
+
+def _clash(name: str, experiments: Mapping[str, Experiment]) -> str | None:
+    """A name that one of the ``experiments`` shares with another, for tables or arms that are not the same."""
+    experiment, every = experiments[name], get_args(TableKind)
+    tables = experiment.declared(name, every).tables.keys()
+    fix = "rename it in the newer of the two files"
+    for other_name, other in experiments.items():
+        if other_name == name:
+            continue
+        for arm in experiment.arms:
+            if arm in other.arms and _settings(experiment, arm) != _settings(other, arm):
+                return f"arms.{arm}: {other_name}.toml has an arm of this name with other settings; {fix}"
+        for table in sorted(tables & other.declared(other_name, every).tables.keys()):
+            return f"tables.{table}: {other_name}.toml has a table of this name, too; {fix}"
+    return None
+
+
+def _settings(experiment: Experiment, arm: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What makes an arm what it is."""
+    return experiment.arms[arm].model_dump(exclude={"label"}), experiment.scales
 
 
 def read_toml(file: Path) -> dict[str, Any]:

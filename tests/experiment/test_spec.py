@@ -118,23 +118,38 @@ def test_an_invalid_table_is_one_clear_error(tmp_path: Path, tables: str, messag
     assert fault(tmp_path, "e") == f"{file}: {message}"
 
 
+def clash(folder: Path, key: str, what: str) -> None:
+    """Checks that a.toml and b.toml are refused for a name that they share, and c.toml, which shares none, is not."""
+    (folder / "c.toml").write_text('kind = "ablation"\ntitle = "t"\n[arms.other]\nlabel = "Other"\n')
+    experiments, faults = load_experiments(folder)
+    assert set(experiments) == {"c"}
+    assert {name: str(error) for name, error in faults.items()} == {
+        name: f"{folder / name}.toml: {key}: {other}.toml has {what}; rename it in the newer of the two files"
+        for name, other in (("a", "b"), ("b", "a"))
+    }
+
+
 def test_a_table_has_one_experiment(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.toml").write_text(f"{EXPERIMENT}[tables.mine]\n")
-    assert "b.toml: tables.mine: a.toml has a table of this name; rename one" in fault(tmp_path, "b")
+    clash(tmp_path, "tables.mine", "a table of this name, too")
 
 
 def test_an_arm_of_two_experiments_is_the_same_arm(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(EXPERIMENT)
     (tmp_path / "b.toml").write_text(EXPERIMENT.replace('"Slow"', '"Slower label"'))
     assert set(load_experiments(tmp_path)[0]) == {"a", "b"}
+    (tmp_path / "b.toml").write_text(EXPERIMENT + "[scales.smoke.lidar]\nrows = 3\n")
+    (tmp_path / "scales").mkdir()
+    (tmp_path / "scales" / "smoke.toml").touch()
+    clash(tmp_path, "arms.rom", "an arm of this name with other settings")
     guarded = '[arms.guarded]\nlabel = "G"\npolicy = "rom"\n'
     for here, there in (("0.5", "0.6"), ("filter = true", ""), ('policy = "rom"', 'policy = "slow"')):
         text = EXPERIMENT + guarded + "filter = true\n"
         (tmp_path / "a.toml").write_text(text)
         (tmp_path / "b.toml").write_text(text.replace(here, there))
         arm = "slow" if here == "0.5" else "guarded"
-        assert f"b.toml: arms.{arm}: a.toml has another arm of this name; rename one" in fault(tmp_path, "b")
+        clash(tmp_path, f"arms.{arm}", "an arm of this name with other settings")
 
 
 def test_the_filter_guards_who_drives_the_policy_of_another(tmp_path: Path) -> None:
