@@ -64,6 +64,11 @@ class Declared(Config):
     tables: dict[str, TableSpec]
 
 
+_SECTIONS: dict[str, Collection[str]] = {"arms": Arm.model_fields, "tables": TableSpec.model_fields, "scales": ()}
+"""Tables of tables in an experiment's file, and what keys these have; those of arms and scales are settings, too."""
+_WITHIN = tuple(f"{section}." for section in _SECTIONS)
+
+
 class Experiment(Config):
     """Arms that are trained alike except for their changes, and evaluated on the same episodes or trials."""
 
@@ -186,7 +191,9 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
     wrong: dict[str, RomnavError] = {}
     for file in sorted(folder.glob("*.toml")):
         try:
-            read[file.stem] = parse(Experiment, read_toml(file), file)
+            data = read_toml(file)
+            _refuse_misplaced(data, file)
+            read[file.stem] = parse(Experiment, data, file)
         except RomnavError as error:
             wrong[file.stem] = error
     drivers = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
@@ -262,6 +269,8 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
 
 def _explain(model: type[BaseModel], key: str, error: Any) -> str:
     match error["type"]:
+        case "extra_forbidden" if key.startswith(_WITHIN) and error["loc"][-1] in Experiment.model_fields:
+            return _misplaced(key, error["loc"][-1])
         case "extra_forbidden":
             return f"unknown key {key}{suggest(error['loc'][-1], _fields(model, error['loc'][:-1]))}"
         case "missing":
@@ -270,6 +279,20 @@ def _explain(model: type[BaseModel], key: str, error: Any) -> str:
             return f"{key}: {error['ctx']['error']}".removeprefix(": ")
         case _:
             return f"key {key}: {error['msg'][0].lower()}{error['msg'][1:]}, not {error['input']!r}"
+
+
+def _refuse_misplaced(data: Mapping[str, Any], file: Path) -> None:
+    for section, own in _SECTIONS.items():
+        tables = data.get(section)
+        for name, table in tables.items() if isinstance(tables, dict) else ():
+            for key in table if isinstance(table, dict) else ():
+                if key in Experiment.model_fields and key not in own:
+                    raise RomnavError(f"{file}: {_misplaced(f'{section}.{name}.{key}', key)}")
+
+
+def _misplaced(key: str, name: str) -> str:
+    """An error about a key of an experiment that was appended to its file, where TOML takes it for the last table's."""
+    return f"unknown key {key}; {name} belongs at the top of the file, above every [arms...] and [tables...]"
 
 
 def _fields(model: type[BaseModel], path: Iterable[Any]) -> list[str]:
