@@ -147,7 +147,8 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     compared = romnav("eval", "--paired")
     assert compared.exit_code == 0, compared.output
     assert ran == []  # everything is evaluated already
-    assert "left out: policy uniform, seed 0 is unfinished" in compared.stderr
+    train = "romnav train policy ARM --scale smoke"
+    assert f"left out: 1 policy that is not finished here (uniform); train with `{train}`\n" in compared.stderr
     assert "uniform-nocap" in compared.stdout
 
 

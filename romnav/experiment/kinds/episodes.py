@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import ROWS_VERSION
+from romnav.experiment.graph.records import differences
 from romnav.experiment.graph.run import missing
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
@@ -55,8 +56,10 @@ def episodes(work: Workspace, arm: str, seed: int, *, joints: bool = False) -> S
 
 def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
     """The episodes of every arm and training seed whose own policy is finished, and why others that were begun are not
-    among them."""
-    stages, left_out = [], []
+    among them: those that are not finished are told of together, as a clone has many."""
+    stages: list[Stage] = []
+    left_out: list[str] = []
+    unfinished: list[str] = []
     experiments = work.project.experiments.values()
     arms = (name for experiment in experiments for name, arm in experiment.arms.items() if arm.trained)
     for arm in dict.fromkeys(arms):
@@ -65,7 +68,15 @@ def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
             if not (reason := missing(trained)):
                 stages.append(episodes(work, arm, seed))
             elif trained.record.exists():
-                left_out.append(f"{trained.name} {reason}")
+                alike = not differences(trained)
+                if alike and not all((trained.folder / name).exists() for name in trained.outputs):
+                    unfinished.append(arm)
+                else:
+                    left_out.append(f"{trained.name} {reason}")
+    if unfinished:
+        count = "1 policy that is" if len(unfinished) == 1 else f"{len(unfinished)} policies that are"
+        train = shlex.join(("romnav", *work.command("train", "policy", "ARM")))
+        left_out.append(f"{count} not finished here ({', '.join(dict.fromkeys(unfinished))}); train with `{train}`")
     return stages, left_out
 
 
