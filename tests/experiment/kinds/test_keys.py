@@ -403,7 +403,7 @@ def test_what_an_arm_begins_with_may_be_in_a_file_that_is_refused(tmp_path: Path
     base = '[arms.base]\nlabel = "B"\nnavigation.ppo.gamma = {}\n'
     for name, gamma in (("theirs", 0.9), ("mine", 0.8)):
         here.project.file(name).write_text(f'kind = "ablation"\ntitle = "t"\n{base.format(gamma)}')
-    with pytest.raises(RomnavError, match="mine.toml: arms.base: theirs.toml has an arm of this name with other"):
+    with pytest.raises(RomnavError, match=r"mine\.toml: arms\.base: theirs\.toml has an arm of this name with other"):
         policy(here, "more", 0)
 
 
