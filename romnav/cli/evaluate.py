@@ -198,11 +198,12 @@ def results(
 @command(app, "check")
 def check(at: AtScale) -> None:
     """Hold the results against the bands in results/<scale>/bands.json (nightly regression)."""
-    from romnav.experiment.bands import check
+    from romnav.experiment.bands import check, read
 
     # bands belong to the project: --results is where the results of today lie
-    bands = at.project.root / "results" / at.work.scale / "bands.json"
-    typer.echo("\n".join(check(_collect(at), bands)))
+    file = at.project.root / "results" / at.work.scale / "bands.json"
+    bands = read(file, at.project)
+    typer.echo("\n".join(check(_collect(at), bands, file)))
 
 
 def _judge_kept(job: DeviceJob, names: list[str], seed: int | None) -> None:

@@ -56,17 +56,17 @@ def episodes(
     out: OutOption = None,
 ) -> None:
     """Draw maps of an arm's episodes: the way it went beside the shortest, on every layer; and count how it fails."""
-    from romnav.experiment.kinds.episodes import look_at
+    from romnav.experiment.kinds.episodes import look_at, tabulate
 
-    seen = look_at(at.work, arm, seed)
-    chosen = seen.choose(failed, where)
+    table = tabulate(at.work, arm, seed)
+    chosen = table.choose(failed, where)
     path = at.picture(out, f"episodes-{arm}.png")
-    typer.echo(seen.failures().to_string())
+    typer.echo(table.failures().to_string())
     if not len(chosen):
         typer.echo("no episode is like that")
         return
     typer.echo(f"{len(chosen)} episodes: {', '.join(map(str, chosen[:20]))}{', ...' if len(chosen) > 20 else ''}")
-    seen.draw(chosen[:count], path)
+    look_at(at.work, arm, seed).draw(chosen[:count], path)
     typer.echo(path)
 
 
@@ -87,9 +87,7 @@ def episode(
 
     opengl.choose()
     from romnav.experiment.kinds.replays import Again
-    from romnav.progress import bar
 
     path = out or at.work.folder / "figures" / f"{arm}-{number}.mp4"
-    with bar(f"film of {arm}, episode {number}") as progress:
-        Again(at.work, arm, seed).film(number, path, speed, size, progress)
+    Again(at.work, arm, seed).film(number, path, speed, size)
     typer.echo(path)

@@ -34,7 +34,7 @@ def view(
     """Replay episodes in 3D in the browser: the tile, the ways, and what an arm saw and decided. Ctrl-C ends it."""
     import threading
 
-    from romnav.experiment.kinds.episodes import look_at
+    from romnav.experiment.kinds.episodes import look_at, tabulate
     from romnav.experiment.kinds.replays import Again
 
     try:
@@ -42,11 +42,11 @@ def view(
     except ModuleNotFoundError as error:
         raise RomnavError(f"romnav view needs {error.name}; run `pip install 'romnav[view]'`") from error
 
-    galleries = {name: look_at(at.work, name, seed) for name in dict.fromkeys(names)}
-    first = next(iter(galleries.values()))
+    first = tabulate(at.work, names[0], seed)
     chosen = first.choose(failed, where) if episode is None else [episode]
     if not chosen or max(chosen) >= len(first.table):
         raise RomnavError(f"no episode is like that; there are 0 to {len(first.table) - 1}")
+    galleries = {name: look_at(at.work, name, seed) for name in dict.fromkeys(names)}
     runs = {name: Again(at.work, name, seed) for name in galleries}
 
     def drive(name: str, index: int) -> Seen:

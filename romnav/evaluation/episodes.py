@@ -17,6 +17,7 @@ from torch import Tensor
 from romnav import files
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import EpisodeSetSpec
+from romnav.progress import Progress
 from romnav.world.build import build
 from romnav.world.geodesic import UNIT
 from romnav.world.spawns import Start, is_cross_level, sample
@@ -176,14 +177,14 @@ def load(path: Path) -> EpisodeSet:
     return episodes
 
 
-def terrain(episodes: EpisodeSet, path: Path, cache: Path | None) -> World:
+def terrain(episodes: EpisodeSet, path: Path, cache: Path | None, progress: Progress | None = None) -> World:
     """The tiles of a set, checked to be the ones that it was drawn on.
 
     Raises:
         RomnavError: A spawn or goal of the set is not free on these tiles, or its geodesic differs: the set was
             drawn by another version of the generator.
     """
-    world = build(episodes.world, cache)
+    world = build(episodes.world, cache, progress)
     start = episodes.start("cpu")
     node = world.node_at(start.tile, start.layer, start.xy)
     goal = start.goal.clamp(max=len(world.goal) - 1)

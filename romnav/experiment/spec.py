@@ -64,6 +64,11 @@ class Declared(Config):
     tables: dict[str, TableSpec]
 
 
+_SECTIONS: dict[str, Collection[str]] = {"arms": Arm.model_fields, "tables": TableSpec.model_fields, "scales": ()}
+"""Tables of tables in an experiment's file, and what keys these have; those of arms and scales are settings, too."""
+_WITHIN = tuple(f"{section}." for section in _SECTIONS)
+
+
 class Experiment(Config):
     """Arms that are trained alike except for their changes, and evaluated on the same episodes or trials."""
 
@@ -178,47 +183,59 @@ def load_experiments(folder: Path) -> tuple[dict[str, Experiment], dict[str, Rom
 
     Returns:
         Experiments by name, and by name what is wrong with those that are none: the file is invalid, names no scale or
-        no arm, or gives another arm or table a name of one before it. They do not take the others down.
+        no arm, or gives an arm or table a name that another one has in another file, which is refused, too, since it
+        is not known which of them is meant. They do not take the others down.
     """
     known = {file.stem for file in folder.glob("scales/*.toml")}
     read: dict[str, Experiment] = {}
     wrong: dict[str, RomnavError] = {}
     for file in sorted(folder.glob("*.toml")):
         try:
-            read[file.stem] = parse(Experiment, read_toml(file), file)
+            data = read_toml(file)
+            _refuse_misplaced(data, file)
+            read[file.stem] = parse(Experiment, data, file)
         except RomnavError as error:
             wrong[file.stem] = error
     drivers = {*SCRIPTED, *(a for e in read.values() for a, arm in e.arms.items() if not arm.policy)}
     whole = not wrong  # an arm that is missed may be in what could not be read
     experiments: dict[str, Experiment] = {}
     for name, experiment in read.items():
-        if fault := _fault(name, experiment, experiments, known, drivers if whole else None):
+        if fault := _fault(experiment, known, drivers if whole else None) or _clash(name, read):
             wrong[name] = RomnavError(f"{folder / name}.toml: {fault}")
         else:
             experiments[name] = experiment
     return experiments, wrong
 
 
-def _fault(
-    name: str, experiment: Experiment, before: Mapping[str, Experiment], scales: set[str], drivers: set[str] | None
-) -> str | None:
-    """What of an experiment does not fit scales, drivers if they are known, and the experiments ``before`` it."""
+def _fault(experiment: Experiment, scales: set[str], drivers: set[str] | None) -> str | None:
+    """What of an experiment does not fit scales, and drivers if they are known."""
     for scale in experiment.scales.keys() - scales:
         return f"scales: unknown scale {scale}{suggest(scale, scales)}"
-    every = get_args(TableKind)
-    for table in experiment.declared(name, every).tables:
-        for first, other in before.items():
-            if table in other.declared(first, every).tables:
-                return f"tables.{table}: {first}.toml has a table of this name; rename one"
-    for arm_name, arm in experiment.arms.items():
+    for name, arm in experiment.arms.items():
         if arm.policy and drivers is not None and arm.policy not in drivers:
-            return f"arms.{arm_name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
-        for first, other in before.items():
-            same = other.arms.get(arm_name)
-            unlike = same and same.model_dump(exclude={"label"}) != arm.model_dump(exclude={"label"})
-            if same and (unlike or other.scales != experiment.scales):
-                return f"arms.{arm_name}: {first}.toml has another arm of this name; rename one"
+            return f"arms.{name}.policy: no arm {arm.policy} that is trained{suggest(arm.policy, drivers)}"
     return None
+
+
+def _clash(name: str, experiments: Mapping[str, Experiment]) -> str | None:
+    """A name that one of the ``experiments`` shares with another, for tables or arms that are not the same."""
+    experiment, every = experiments[name], get_args(TableKind)
+    tables = experiment.declared(name, every).tables.keys()
+    fix = "rename it in the newer of the two files"
+    for other_name, other in experiments.items():
+        if other_name == name:
+            continue
+        for arm in experiment.arms:
+            if arm in other.arms and _settings(experiment, arm) != _settings(other, arm):
+                return f"arms.{arm}: {other_name}.toml has an arm of this name with other settings; {fix}"
+        for table in sorted(tables & other.declared(other_name, every).tables.keys()):
+            return f"tables.{table}: {other_name}.toml has a table of this name, too; {fix}"
+    return None
+
+
+def _settings(experiment: Experiment, arm: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What makes an arm what it is."""
+    return experiment.arms[arm].model_dump(exclude={"label"}), experiment.scales
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -252,6 +269,8 @@ def parse(model: type[C], data: Mapping[str, Any], file: Path, prefix: str = "")
 
 def _explain(model: type[BaseModel], key: str, error: Any) -> str:
     match error["type"]:
+        case "extra_forbidden" if key.startswith(_WITHIN) and error["loc"][-1] in Experiment.model_fields:
+            return _misplaced(key, error["loc"][-1])
         case "extra_forbidden":
             return f"unknown key {key}{suggest(error['loc'][-1], _fields(model, error['loc'][:-1]))}"
         case "missing":
@@ -260,6 +279,20 @@ def _explain(model: type[BaseModel], key: str, error: Any) -> str:
             return f"{key}: {error['ctx']['error']}".removeprefix(": ")
         case _:
             return f"key {key}: {error['msg'][0].lower()}{error['msg'][1:]}, not {error['input']!r}"
+
+
+def _refuse_misplaced(data: Mapping[str, Any], file: Path) -> None:
+    for section, own in _SECTIONS.items():
+        tables = data.get(section)
+        for name, table in tables.items() if isinstance(tables, dict) else ():
+            for key in table if isinstance(table, dict) else ():
+                if key in Experiment.model_fields and key not in own:
+                    raise RomnavError(f"{file}: {_misplaced(f'{section}.{name}.{key}', key)}")
+
+
+def _misplaced(key: str, name: str) -> str:
+    """An error about a key of an experiment that was appended to its file, where TOML takes it for the last table's."""
+    return f"unknown key {key}; {name} belongs at the top of the file, above every [arms...] and [tables...]"
 
 
 def _fields(model: type[BaseModel], path: Iterable[Any]) -> list[str]:

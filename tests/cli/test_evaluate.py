@@ -9,7 +9,11 @@ from pathlib import Path
 import pytest
 
 from romnav.evaluation.paired import rows
-from tests.cli.conftest import fails, romnav
+from romnav.experiment.bands import read
+from romnav.experiment.project import Project
+from tests.cli.conftest import ROOT, edit, fails, romnav
+
+BANDS = Path("results") / "smoke" / "bands.json"
 
 
 def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> None:
@@ -95,23 +99,58 @@ def test_rows_of_arms_that_are_not_asked_for_may_be_of_another_set(
     assert (refused.exit_code, "rows of different episode sets" in refused.stderr) == (1, True)
 
 
-@pytest.mark.parametrize(
-    ("band", "code", "message"),
-    [
-        ([0, 100], 0, "rom sr_45"),
-        ([100, 100], 1, "rom sr_45 "),
-        (None, 1, "no readable file of bands"),
-    ],
-)
-def test_check_names_the_metric_outside_of_its_band(
-    evaluated: Path, band: list[int] | None, code: int, message: str
-) -> None:
-    if band:
-        file = evaluated / "results" / "smoke" / "bands.json"
-        file.write_text(json.dumps({"rom": {"sr_45": band, "spl": [0, 1]}}))
+@pytest.mark.parametrize(("band", "code", "message"), [([0, 100], 0, "rom sr_45"), ([100, 100], 1, "rom sr_45 ")])
+def test_check_names_the_metric_outside_of_its_band(evaluated: Path, band: list[int], code: int, message: str) -> None:
+    (evaluated / BANDS).write_text(json.dumps({"rom": {"sr_45": band, "spl": [0, 1]}}))
     result = romnav("check")
     assert result.exit_code == code
     assert message in (result.stderr if code else result.stdout)
-    if band and code:
+    if code:
         assert "1 of 2 metrics outside" in result.stderr
         assert "band 100 to 100" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, 'cannot be read (no such file or directory); write {"rom": {"sr_45": [31, 100]}}: arms'),
+        ("rom", "not valid JSON (Expecting value: line 1 column 1 (char 0)); write {"),
+        ("[" * 100_000, "not valid JSON ("),
+        ("{}", "{} holds no bands; write {"),
+        ("[1]", "[1] holds no bands; write {"),
+        ('{"rom": 3}', "key rom: 3 holds no bands; write {"),
+        ('{"rom": {}}', "key rom: {} holds no bands; write {"),
+        ('{"romm": {"sr_45": [0, 1]}}', "key romm: unknown arm romm; did you mean rom?"),
+        ('{"rom": {"sr_46": [0, 1]}}', "key rom.sr_46: unknown metric; did you mean sr_45?"),
+        ('{"rom": {"hours": [0, 1]}}', "key rom.hours: unknown metric; there are falls, spl, sr_120,"),
+        ('{"rom": {"sr_45": [2, 1]}}', "key rom.sr_45: [2, 1] is no band; write [lowest, highest], two numbers of"),
+        ('{"rom": {"sr_45": [0, NaN]}}', "key rom.sr_45: [0, NaN] is no band; write [lowest, highest]"),
+        ('{"rom": {"sr_45": [0, Infinity]}}', "key rom.sr_45: [0, Infinity] is no band; write"),
+        ('{"rom": {"sr_45": [0, "1"]}}', 'key rom.sr_45: [0, "1"] is no band; write'),
+        ('{"rom": {"sr_45": [0, true]}}', "key rom.sr_45: [0, true] is no band; write"),
+        ('{"rom": {"sr_45": [0]}}', "key rom.sr_45: [0] is no band; write"),
+        ('{"rom": {"sr_45": 50}}', "key rom.sr_45: 50 is no band; write"),
+    ],
+)
+def test_a_wrong_file_of_bands_is_one_clear_error(evaluated: Path, text: str | None, message: str) -> None:
+    """It would check nothing, or read as a regression."""
+    file = evaluated / BANDS
+    if text is not None:
+        file.write_text(text)
+    assert fails("check").startswith(f"{file}: {message}")
+
+
+def test_an_arm_with_a_band_may_be_in_an_experiment_that_is_invalid(evaluated: Path) -> None:
+    edit(evaluated / "experiments" / "spawn-goal.toml", "[arms.uniform]", "[arms.uniform]\nlabel = 3")
+    (evaluated / BANDS).write_text('{"uniform": {"sr_45": [0, 100]}}')
+    assert "bands.json: key uniform: " in (message := fails("check"))
+    assert "spawn-goal.toml: not valid TOML" in message
+
+
+@pytest.mark.parametrize("scale", ["smoke", "cpu"])
+def test_the_projects_own_bands_are_valid(scale: str) -> None:
+    file = ROOT / "results" / scale / "bands.json"
+    assert read(file, Project(ROOT, ROOT / "results")) == {
+        arm: {metric: tuple(band) for metric, band in metrics.items()}
+        for arm, metrics in json.loads(file.read_text()).items()
+    }

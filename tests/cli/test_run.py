@@ -37,6 +37,17 @@ def test_a_command_refuses_an_experiment_of_another_kind(project: Path) -> None:
     assert fails("run", "safety", "--arm", "oracel").endswith("safety.toml: no arm oracel; did you mean oracle?")
 
 
+def test_neither_of_two_arms_with_one_name_is_trained_in_the_folder_of_the_other(project: Path) -> None:
+    shared, mine = (project / "experiments" / f"{name}.toml" for name in ("spawn-goal", "mine"))
+    shutil.copy(shared, mine)
+    edit(mine, "stair_probability = 0.0", "stair_probability = 0.1")
+    what = "has an arm of this name with other settings; rename it in the newer of the two files"
+    assert fails("run", "ablation", "mine", "--print") == f"{mine}: arms.uniform: spawn-goal.toml {what}"
+    assert fails("run", "ablation", "spawn-goal") == f"{shared}: arms.uniform: mine.toml {what}"
+    assert fails("eval", "uniform").endswith(f"arms.uniform: spawn-goal.toml {what}")
+    assert romnav("run", "ablation", "pretrain", "--print").exit_code == 0
+
+
 def test_trials_are_reported_from_their_rows(project: Path, trial_run: Callable[..., trial_rows.TrialRows]) -> None:
     assert "no trials yet; run `romnav run safety`" in romnav("tables", "safety").stderr
     folder = project / "results" / "smoke"
@@ -136,7 +147,8 @@ def test_the_main_job_runs_every_stage_once_and_then_nothing(
     compared = romnav("eval", "--paired")
     assert compared.exit_code == 0, compared.output
     assert ran == []  # everything is evaluated already
-    assert "left out: policy uniform, seed 0 is unfinished" in compared.stderr
+    train = "romnav train policy ARM --scale smoke"
+    assert f"left out: 1 policy that is not finished here (uniform); train with `{train}`\n" in compared.stderr
     assert "uniform-nocap" in compared.stdout
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -98,6 +99,39 @@ def test_an_invalid_experiment_is_one_clear_error(tmp_path: Path, text: str, mes
     assert fault(tmp_path, "e").startswith(f"{file}: {message}")
 
 
+PLACE = "belongs at the top of the file, above every [arms...] and [tables...]"
+
+
+@pytest.mark.parametrize(
+    ("table", "key"),
+    [
+        *(
+            ("", f"arms.slow.{line}")
+            for line in (
+                "seeds = [0, 1]",
+                'published = "paper"',
+                'reference = "rom"',
+                'kind = "ablation"',
+                'title = "t"',
+            )
+        ),
+        ("", "arms.slow.scales.smoke.lidar.rows = 3"),
+        ("", "arms.slow.tables.x = {}"),
+        ('[arms.driven]\nlabel = "D"\npolicy = "rom"\n', "arms.driven.seeds = [0, 1]"),
+        ("[tables.x]\n", "tables.x.seeds = [0, 1]"),
+        ("[tables.x]\n", 'tables.x.title = "t"'),
+        ("[scales.smoke]\n", "scales.smoke.seeds = [0, 1]"),
+    ],
+)
+def test_a_key_appended_to_the_file_is_told_its_place(tmp_path: Path, table: str, key: str) -> None:
+    file = tmp_path / "e.toml"
+    section, name, line = key.split(".", 2)
+    appended = re.split(r"[. ]", line)[0]
+    head = "".join(row for row in EXPERIMENT.splitlines(True) if not row.startswith(appended))
+    file.write_text(f"{head}{table}{line}\n")
+    assert fault(tmp_path, "e") == f"{file}: unknown key {section}.{name}.{appended}; {appended} {PLACE}"
+
+
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
@@ -118,23 +152,38 @@ def test_an_invalid_table_is_one_clear_error(tmp_path: Path, tables: str, messag
     assert fault(tmp_path, "e") == f"{file}: {message}"
 
 
+def clash(folder: Path, key: str, what: str) -> None:
+    """Checks that a.toml and b.toml are refused for a name that they share, and c.toml, which shares none, is not."""
+    (folder / "c.toml").write_text('kind = "ablation"\ntitle = "t"\n[arms.other]\nlabel = "Other"\n')
+    experiments, faults = load_experiments(folder)
+    assert set(experiments) == {"c"}
+    assert {name: str(error) for name, error in faults.items()} == {
+        name: f"{folder / name}.toml: {key}: {other}.toml has {what}; rename it in the newer of the two files"
+        for name, other in (("a", "b"), ("b", "a"))
+    }
+
+
 def test_a_table_has_one_experiment(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.toml").write_text(f"{EXPERIMENT}[tables.mine]\n")
-    assert "b.toml: tables.mine: a.toml has a table of this name; rename one" in fault(tmp_path, "b")
+    clash(tmp_path, "tables.mine", "a table of this name, too")
 
 
 def test_an_arm_of_two_experiments_is_the_same_arm(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(EXPERIMENT)
     (tmp_path / "b.toml").write_text(EXPERIMENT.replace('"Slow"', '"Slower label"'))
     assert set(load_experiments(tmp_path)[0]) == {"a", "b"}
+    (tmp_path / "b.toml").write_text(EXPERIMENT + "[scales.smoke.lidar]\nrows = 3\n")
+    (tmp_path / "scales").mkdir()
+    (tmp_path / "scales" / "smoke.toml").touch()
+    clash(tmp_path, "arms.rom", "an arm of this name with other settings")
     guarded = '[arms.guarded]\nlabel = "G"\npolicy = "rom"\n'
     for here, there in (("0.5", "0.6"), ("filter = true", ""), ('policy = "rom"', 'policy = "slow"')):
         text = EXPERIMENT + guarded + "filter = true\n"
         (tmp_path / "a.toml").write_text(text)
         (tmp_path / "b.toml").write_text(text.replace(here, there))
         arm = "slow" if here == "0.5" else "guarded"
-        assert f"b.toml: arms.{arm}: a.toml has another arm of this name; rename one" in fault(tmp_path, "b")
+        clash(tmp_path, f"arms.{arm}", "an arm of this name with other settings")
 
 
 def test_the_filter_guards_who_drives_the_policy_of_another(tmp_path: Path) -> None:
@@ -171,6 +220,7 @@ def test_an_arm_changes_only_what_it_names(scales: Path) -> None:
         ("navigation.env.envz = 3", "unknown key arms.slow.navigation.env.envz; did you mean envs?"),
         ("navigaton.env.envs = 3", "unknown key arms.slow.navigaton; did you mean navigation?"),
         ('navigation.env.envs = "3"', "key arms.slow.navigation.env.envs: input should be a valid integer"),
+        ("[arms.slow.navigation.env]\nseeds = [0]", f"unknown key arms.slow.navigation.env.seeds; seeds {PLACE}"),
         ("navigation = 3", "key arms.slow.navigation: input should be an object, not 3"),
         ("evaluation.duration = 60.0", "arms.slow.evaluation: set [evaluation] of the scale, all arms share it"),
     ],
@@ -259,6 +309,7 @@ def test_a_scale_of_one_body_has_its_settings(scales: Path) -> None:
         ('[bodies.g1.kickstart]\ninit = "old"', "key bodies.g1.kickstart.init: input should be 'fresh' or 'teacher'"),
         ("[bodies]\ng1 = 3", "key bodies.g1: input should be an object, not 3"),
         ("[bodies.g2.lidar]\nrows = 3", "bodies.g2"),
+        ("[tables.x]", "unknown key tables; there are begin, bodies,"),
         ("[bodys.g1.lidar]\nrows = 3", "unknown key bodys; did you mean bodies?"),
     ],
 )

@@ -9,18 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 from romnav.errors import RomnavError
 from romnav.evaluation.spec import ROWS_VERSION
+from romnav.experiment.graph.records import differences
 from romnav.experiment.graph.run import missing
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.workspace import Workspace
-from romnav.progress import Progress
+from romnav.progress import Progress, bar
 
 if TYPE_CHECKING:
     from romnav.evaluation.episodes import EpisodeSet
     from romnav.evaluation.postures import Postures
     from romnav.evaluation.tracks import Tracks
-    from romnav.report.paired.gallery import EpisodeGallery
+    from romnav.report.paired.gallery import EpisodeGallery, EpisodeTable
     from romnav.world.world import World
 
 POSTURES = "postures.npz"
@@ -55,8 +56,10 @@ def episodes(work: Workspace, arm: str, seed: int, *, joints: bool = False) -> S
 
 def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
     """The episodes of every arm and training seed whose own policy is finished, and why others that were begun are not
-    among them."""
-    stages, left_out = [], []
+    among them: those that are not finished are told of together, as a clone has many."""
+    stages: list[Stage] = []
+    left_out: list[str] = []
+    unfinished: list[str] = []
     experiments = work.project.experiments.values()
     arms = (name for experiment in experiments for name, arm in experiment.arms.items() if arm.trained)
     for arm in dict.fromkeys(arms):
@@ -65,7 +68,15 @@ def of_trained_arms(work: Workspace) -> tuple[list[Stage], list[str]]:
             if not (reason := missing(trained)):
                 stages.append(episodes(work, arm, seed))
             elif trained.record.exists():
-                left_out.append(f"{trained.name} {reason}")
+                alike = not differences(trained)
+                if alike and not all((trained.folder / name).exists() for name in trained.outputs):
+                    unfinished.append(arm)
+                else:
+                    left_out.append(f"{trained.name} {reason}")
+    if unfinished:
+        count = "1 policy that is" if len(unfinished) == 1 else f"{len(unfinished)} policies that are"
+        train = shlex.join(("romnav", *work.command("train", "policy", "ARM")))
+        left_out.append(f"{count} not finished here ({', '.join(dict.fromkeys(unfinished))}); train with `{train}`")
     return stages, left_out
 
 
@@ -85,7 +96,7 @@ def _evaluate(driven: Driven, joints: bool, stage: Stage, session: Session, prog
 
     work, settings, path = driven.work, driven.settings, paired_set(driven.work)
     paired = load(path)
-    world = terrain(paired, path, work.project.worlds).to(session.device)
+    world = terrain(paired, path, work.project.worlds, progress).to(session.device)
     provenance = driven.provenance(stage, paired.digest, settings.evaluation)
     driver = driven.driver(world, session.device)
     recorder = postures.PostureRecorder() if joints else tracks.Recorder()
@@ -115,24 +126,36 @@ def _evaluate(driven: Driven, joints: bool, stage: Stage, session: Session, prog
     return {}
 
 
-def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
-    """The evaluated episodes of an arm with their tracks.
+def tabulate(work: Workspace, arm: str, seed: int) -> EpisodeTable:
+    """The evaluated episodes of an arm without their terrain, which may take minutes to build.
 
     Raises:
         RomnavError: They are missing or out of date.
     """
     from romnav.evaluation.paired import rows
-    from romnav.report.paired.gallery import EpisodeGallery
+    from romnav.report.paired.gallery import EpisodeTable
 
     stage, path = episodes(work, arm, seed), paired_set(work)
-    run = rows.read(stage.folder / "episodes.parquet")
-    tracks, postures, _ = read_ways(stage.folder)
-    paired, world = ground(path, work.project.worlds)
-    if run.provenance.episode_set != paired.digest:
+    run, digest = rows.read(stage.folder / "episodes.parquet"), episode_set(path).digest
+    if run.provenance.episode_set != digest:
         raise RomnavError(
-            f"{run.source}: rows of episode set {run.provenance.episode_set}, but {path} is {paired.digest}; "
+            f"{run.source}: rows of episode set {run.provenance.episode_set}, but {path} is {digest}; "
             f"run `romnav {shlex.join(stage.command)}`"
         )
+    return EpisodeTable(run)
+
+
+def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
+    """The evaluated episodes of an arm with their tracks and their terrain.
+
+    Raises:
+        RomnavError: They are missing or out of date.
+    """
+    from romnav.report.paired.gallery import EpisodeGallery
+
+    run = tabulate(work, arm, seed).run
+    tracks, postures, _ = read_ways(episodes(work, arm, seed).folder)
+    paired, world = ground(paired_set(work), work.project.worlds)
     return EpisodeGallery(run, tracks, paired, world, postures)
 
 
@@ -150,9 +173,18 @@ def read_ways(folder: Path) -> tuple[Tracks, Postures | None, dict[str, str]]:
 
 
 @cache
-def ground(path: Path, worlds: Path) -> tuple[EpisodeSet, World]:
-    """The episodes of a file and their terrain, read once however many arms are looked at."""
-    from romnav.evaluation.episodes import load, terrain
+def episode_set(path: Path) -> EpisodeSet:
+    """The episodes of a file, read once."""
+    from romnav.evaluation.episodes import load
 
-    paired = load(path)
-    return paired, terrain(paired, path, worlds)
+    return load(path)
+
+
+@cache
+def ground(path: Path, worlds: Path) -> tuple[EpisodeSet, World]:
+    """The episodes of a file and their terrain, read or built once however many arms are looked at, with its bar."""
+    from romnav.evaluation.episodes import terrain
+
+    paired = episode_set(path)
+    with bar("world") as progress:
+        return paired, terrain(paired, path, worlds, progress)

@@ -59,7 +59,7 @@ def _compare(driven: Driven, stage: Stage, session: Session, progress: Progress)
     rows = []
     for name, episodes, world in (
         ("seen", seen, ground),
-        ("unseen", unseen, terrain(unseen, path, work.project.worlds)),
+        ("unseen", unseen, terrain(unseen, path, work.project.worlds, progress)),
     ):
         here, env = world.to(session.device), settings.navigation.env
         found = along.judge(

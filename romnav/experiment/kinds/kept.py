@@ -141,7 +141,7 @@ def _judge(
 
     settings, path = work.arm_settings(str(trained.arm)), stage.reads[0]
     episodes = load(path)
-    world = terrain(episodes, path, work.project.worlds).to(session.device)
+    world = terrain(episodes, path, work.project.worlds, progress).to(session.device)
     seen = perception(work, trained, settings, world, noise=NOISE, device=session.device)
     depth = seen.depth.encoder if seen.depth else None
     conditions = _conditions(stage, policies)

@@ -51,7 +51,7 @@ def _count(drivers: list[Driven], stage: Stage, session: Session, progress: Prog
     work = drivers[0].work
     path = _episodes(work)
     dev = load(path)
-    world = terrain(dev, path, work.project.worlds)
+    world = terrain(dev, path, work.project.worlds, progress)
     rows: list[dict[str, Any]] = []
     for driven in drivers:
         env, spec = driven.settings.navigation.env, driven.settings.evaluation

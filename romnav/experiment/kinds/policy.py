@@ -89,12 +89,14 @@ def _trained(work: Workspace, arm: str, setting: str, other: str) -> str:
     """Where the ``setting`` of ``arm`` stands that names the ``other`` one.
 
     Raises:
-        RomnavError: That is not trained.
+        RomnavError: That is not trained, or may be in an experiment that is invalid.
     """
     project = work.project
     key = f"{project.file(project.having(arm)[0])}: arms.{arm}.{setting}"
     trained = {a for e in project.experiments.values() for a, spec in e.arms.items() if spec.trained}
     if other not in trained:
+        if project.faults and other not in project.arms:
+            project.having(other)  # tells what is wrong with a file that may have it
         raise RomnavError(f"{key}: no arm {other} that is trained{suggest(other, trained)}")
     return key
 

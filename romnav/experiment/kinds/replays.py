@@ -12,9 +12,9 @@ import numpy as np
 from romnav.errors import RomnavError
 from romnav.experiment.kinds._driven import Driven
 from romnav.experiment.kinds.encoder import encoder
-from romnav.experiment.kinds.episodes import ground, paired_set, read_ways
+from romnav.experiment.kinds.episodes import episode_set, ground, paired_set, read_ways
 from romnav.experiment.workspace import Workspace
-from romnav.progress import Progress
+from romnav.progress import Progress, bar
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,9 +71,8 @@ class Again:
         from romnav.evaluation.rollout import Policy
         from romnav.evaluation.shield import Shield
 
+        self._check(episode)
         paired, world = self.ground
-        if not 0 <= episode < len(paired):
-            raise RomnavError(f"episode {episode}: there are 0 to {len(paired) - 1} in {paired.name}")
         driver, settings = self._driver, self.settings
         if isinstance(driver, Policy):
             driver.actor.reset()
@@ -96,6 +95,17 @@ class Again:
             progress=progress,
         )
 
+    def _check(self, episode: int) -> None:
+        """Checks what needs no terrain, which may take minutes to build.
+
+        Raises:
+            RomnavError: There is no such episode, or no policy.
+        """
+        paired = episode_set(paired_set(self._driven.work))
+        if not 0 <= episode < len(paired):
+            raise RomnavError(f"episode {episode}: there are 0 to {len(paired) - 1} in {paired.name}")
+        _ = self._critic  # reads the policy
+
     def segment(self, sight: Sight | None) -> NDArray[np.int8] | None:
         """Classes (K, rows, columns) that the arm's pretrained encoder sees; None where it has none."""
         import torch
@@ -108,8 +118,8 @@ class Again:
         ranges = torch.from_numpy(sight.ranges)
         return load_autoencoder(pretrained.folder / "encoder.pt").segment(ranges).numpy()
 
-    def film(self, episode: int, path: Path, speed: float, size: int, progress: Progress) -> None:
-        """Writes an episode as a video, ``speed`` times as fast as it was, ``size`` pixels high.
+    def film(self, episode: int, path: Path, speed: float, size: int) -> None:
+        """Writes an episode as a video, ``speed`` times as fast as it was, ``size`` pixels high, with progress.
 
         Raises:
             RomnavError: As `drive`; it cannot be drawn or written.
@@ -118,14 +128,16 @@ class Again:
         from romnav.report.replay.video import RATE, Film, check, write
 
         check(path)
-        again = self.drive(episode)
+        self._check(episode)
         paired, world = self.ground
         goal = np.array([paired.columns[f"goal_{axis}"][episode] for axis in "xyz"])
         (route,) = shortest(world, paired, [episode])
         tile, period = world.tiles[paired.columns["tile"][episode]], self.settings.navigation.env.period
-        film = Film(tile, again, goal, route, self.settings.locomotion.robot, size)
-        count = round(len(again.command) * period / speed * RATE) + RATE
-        write(path, _told(film.frames(speed, period), count, progress))
+        with bar(f"film of {self._driven.arm}, episode {episode}") as progress:
+            again = self.drive(episode, progress=progress)
+            film = Film(tile, again, goal, route, self.settings.locomotion.robot, size)
+            count = round(len(again.command) * period / speed * RATE) + RATE
+            write(path, _told(film.frames(speed, period), count, progress))
 
 
 def _told(frames: Iterator[NDArray[np.uint8]], count: int, progress: Progress) -> Iterator[NDArray[np.uint8]]:

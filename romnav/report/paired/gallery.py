@@ -17,13 +17,11 @@ from romnav.report.paired.maps import draw_maps
 from romnav.world.world import World
 
 
-class EpisodeGallery:
-    """Rows and tracks of an arm on the terrain they are of, and a humanoid's postures if they were kept."""
+class EpisodeTable:
+    """Rows of an arm; they need no terrain."""
 
-    def __init__(
-        self, run: EpisodeRows, tracks: Tracks, episodes: EpisodeSet, world: World, postures: Postures | None = None
-    ) -> None:
-        self.run, self.tracks, self.episodes, self.world, self.postures = run, tracks, episodes, world, postures
+    def __init__(self, run: EpisodeRows) -> None:
+        self.run = run
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -50,6 +48,16 @@ class EpisodeGallery:
         """Failed episodes by where the robot got (rows) and what it did in the end (columns)."""
         counts = pd.crosstab(self.table["where"], self.table["how"])
         return counts.reindex(index=list(WHERE), columns=list(HOW), fill_value=0)
+
+
+class EpisodeGallery(EpisodeTable):
+    """Rows and tracks of an arm on the terrain they are of, and a humanoid's postures if they were kept."""
+
+    def __init__(
+        self, run: EpisodeRows, tracks: Tracks, episodes: EpisodeSet, world: World, postures: Postures | None = None
+    ) -> None:
+        super().__init__(run)
+        self.tracks, self.episodes, self.world, self.postures = tracks, episodes, world, postures
 
     def draw(self, chosen: Sequence[int], path: Path) -> None:
         """Draw maps of the chosen episodes and save them to ``path`` (type by its suffix)."""

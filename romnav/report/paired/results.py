@@ -14,7 +14,11 @@ from romnav.evaluation.paired.statistics import Bootstrap
 from romnav.evaluation.spec import HORIZONS
 
 ROWS_FILE = "episodes.parquet"
-
+METRICS = (
+    *("sr_45", "sr_120", "sr_45_same", "sr_45_cross", "sr_120_same", "sr_120_cross"),
+    *("t2g", "spl", "falls", "timeouts"),
+)
+"""Names of the metrics of an arm."""
 
 Run = tuple[str, int]
 """An arm and one of its training seeds."""
@@ -74,16 +78,8 @@ def collect(results_dir: Path, scale: str, runs: Collection[Run] | None = None) 
 
 
 def _arm(run: rows.EpisodeRows) -> dict[str, Any]:
-    total, same, cross = (metrics.evaluate(run.columns, level) for level in metrics.LEVELS)
-    values = {
-        "sr_45": total["sr_45"],
-        "sr_120": total["sr_120"],
-        "sr_45_same": same["sr_45"],
-        "sr_45_cross": cross["sr_45"],
-        "sr_120_same": same["sr_120"],
-        "sr_120_cross": cross["sr_120"],
-        **{name: total[name] for name in ("t2g", "spl", "falls", "timeouts")},
-    }
+    found = {level: metrics.evaluate(run.columns, level) for level in metrics.LEVELS}
+    values = {name: found[level][metric] for name in METRICS for metric, level in [metrics.split(name)]}
     return {
         "arm": run.arm,
         "seed": run.seed,

@@ -397,6 +397,16 @@ def test_only_trained_arms_before_it_can_be_begun_with(tmp_path: Path, begin: st
         policy(here, "more", 0)
 
 
+def test_what_an_arm_begins_with_may_be_in_a_file_that_is_refused(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    here.project.file("on").write_text(BEGIN.replace('begin = "rom"', 'begin = "base"'))
+    base = '[arms.base]\nlabel = "B"\nnavigation.ppo.gamma = {}\n'
+    for name, gamma in (("theirs", 0.9), ("mine", 0.8)):
+        here.project.file(name).write_text(f'kind = "ablation"\ntitle = "t"\n{base.format(gamma)}')
+    with pytest.raises(RomnavError, match=r"mine\.toml: arms\.base: theirs\.toml has an arm of this name with other"):
+        policy(here, "more", 0)
+
+
 def test_a_run_begins_with_one_policy(tmp_path: Path) -> None:
     here = workspace(tmp_path)
     text = KICKSTART.replace("concentration = 20.0", 'init = "teacher"\nbegin = "rom"')
