@@ -81,6 +81,7 @@ _TEX = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "†": r"$\dagger$",
+    "‡": r"$\ddagger$",
     "−": "$-$",
     "–": "--",
     "±": r"$\pm$",

@@ -10,8 +10,8 @@ from pydantic import Field, field_serializer, field_validator, model_validator
 from romnav.config import Config
 from romnav.evaluation.spec import METRICS
 
-TableKind = Literal["performance", "success", "failures", "contrasts", "curves", "trials"]
-_CHOICES: dict[TableKind, set[str]] = {"curves": {"kind", "caption"}, "trials": {"kind"}}
+TableKind = Literal["performance", "success", "failures", "contrasts", "curves", "trials", "rewards"]
+_CHOICES: dict[TableKind, set[str]] = {"curves": {"kind", "caption"}, "trials": {"kind"}, "rewards": {"kind"}}
 """What can be chosen of tables that are no lists of metrics."""
 PAIRED: frozenset[TableKind] = frozenset({"performance", "success", "failures", "contrasts"})
 """Kinds that are made of paired episodes."""
@@ -72,7 +72,8 @@ class TableSpec(Config):
 
     kind: TableKind = "performance"
     """What it shows: metrics per arm (performance; success or failures by level), differences of each arm to the
-    reference (contrasts), where training ends (curves), or trials in scenes with the safety filter off and on."""
+    reference (contrasts), where training ends (curves), trials in scenes with the safety filter off and on, or the
+    weights of the reward."""
     caption: str = ""
     """What stands above it, before what it is made of; empty is the experiment's title with the metrics' meaning."""
     reference: Entry = Entry(arm="")
