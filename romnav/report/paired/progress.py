@@ -14,7 +14,10 @@ from matplotlib.figure import Figure
 from romnav.errors import RomnavError
 from romnav.report.formats import literal
 
-COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b", "#7b5aa6", "#c99700", "#4bacc6")
+COLOURS = (
+    *("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b"),
+    *("#7b5aa6", "#c99700", "#4bacc6", "#e377c2", "#111111"),
+)
 PANELS = (
     ("steps", "sr_120_same", "same level, 120 s"),
     ("steps", "sr_120_cross", "across levels, 120 s"),
