@@ -21,6 +21,9 @@ from romnav.sensing.lidar import Lidar
 from romnav.world.spawns import Start
 from romnav.world.world import World
 
+SCAN_NOISE = 2_000_003
+"""Added to the seed of the trials for that of the scans' noise: it is not to depend on where a trial starts."""
+
 
 class Shield:
     """The safety filter of ``robots`` robots, fed by a LiDAR of its own."""
@@ -34,7 +37,7 @@ class Shield:
         barrier = spec.filter.filter.model_copy(update={"period": env.period, **limits})
         self._lidar = Lidar([tile.solids for tile in world.tiles], spec.sensor, device)
         self._arms = OwnArms(robot, self._lidar.directions, levelled=True, device=device) if robot else None
-        self._corruption = Corruption(spec.corruption, spec.seed, device)
+        self._corruption = Corruption(spec.corruption, spec.seed + SCAN_NOISE, device)
         self._filter = SafetyFilter(robots, spec.filter.model_copy(update={"filter": barrier}), device)
         self._mount = torch.tensor([0.0, 0.0, spec.sensor.height], device=device)
         self._pose = torch.full((robots, 4), torch.nan, device=device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import reduce
 from pathlib import Path
@@ -88,6 +89,24 @@ class Scale(Config):
                     f"{name}.duration: {duration} s in steps of {env.period} s (navigation.env.period); make it 1 to "
                     f"{MOST_STEPS:,} steps"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _encoders_fit(self) -> Self:
+        for image, training in (("lidar", self.pretrain), ("depth", self.pretrain_depth)):
+            sensor = getattr(self, image)
+            for axis, pixels, strides in zip(
+                ("rows", "columns"),
+                (sensor.rows, sensor.columns),
+                zip(*training.encoder.strides, strict=True),
+                strict=True,
+            ):
+                if (merged := math.prod(strides)) >= 2 * pixels:
+                    name = "pretrain" if image == "lidar" else "pretrain_depth"
+                    raise ValueError(
+                        f"{name}.encoder.strides: {merged:,} {axis} become one, of {pixels} ({image}.{axis}): most of "
+                        "the image would be padding; lower them"
+                    )
         return self
 
     @property

@@ -14,9 +14,8 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from romnav.report.pictures import COLOURS
-from romnav.sensing.corruption import Corruption
 from romnav.sensing.encoder import Autoencoder
-from romnav.sensing.pretrain import Poses, Sensor
+from romnav.sensing.pretrain import Poses, Sensor, corrupter
 from romnav.sensing.spec import UPRIGHT, CorruptionSpec, SwaySpec
 from romnav.world.grids import Grids
 from romnav.world.solids import Label
@@ -57,7 +56,7 @@ def draw_encoder(
     figure = Figure(figsize=(13.0, 0.5 + len(rows) * (2.6 / ratio + 0.25)), layout="constrained")
     axes = figure.subplots(len(rows), len(TITLES), squeeze=False)
     for (share, k, kind), line in zip(rows, axes, strict=True):
-        corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), 1, device)
+        corrupt = corrupter(corruption.model_copy(update={"dropout": (share, share)}), 1, device)
         seen = corrupt(clean[k : k + 1], index[k : k + 1], index[k : k + 1])
         out = model.decoder(model.encoder.posterior(seen)[0])
         valid = (out.valid > 0).squeeze(0)

@@ -357,8 +357,8 @@ def filter_velocity(
     if h.ndim != 3 or min(h.shape[1:]) < 2 or h.dtype != torch.float32:
         raise RomnavError(f"h is {h.dtype} {tuple(h.shape)}; expected torch.float32 (robots, rows, columns)")
     for name, x in (("position", position), ("velocity", velocity)):
-        if x.shape != (robots, 2):
-            raise RomnavError(f"{name} has shape {tuple(x.shape)}; expected ({robots}, 2)")
+        if x.shape != (robots, 2) or not x.is_floating_point():
+            raise RomnavError(f"{name} is {x.dtype} {tuple(x.shape)}; expected floating point ({robots}, 2)")
     spec = spec or FilterSpec()
     limit = torch.inf
     lower, upper = (-limit, -limit), (limit, limit)

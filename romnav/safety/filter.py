@@ -24,6 +24,9 @@ class SafetyFilter:
         spec: All settings.
         device: Torch device.
         workers: Threads (CPU); kernels release the interpreter lock.
+
+    Raises:
+        RomnavError: There is no robot; also of all methods, for shapes and types that do not fit.
     """
 
     def __init__(self, robots: int, spec: SafetySpec | None = None, device: str = "cpu", workers: int = 1) -> None:
@@ -33,6 +36,8 @@ class SafetyFilter:
         self._prepare(robots)
 
     def _prepare(self, robots: int) -> None:
+        if robots < 1:
+            raise RomnavError(f"a safety filter of {robots} robots; it needs one or more")
         # A few robots at a time keep their grids in a core's cache; a GPU takes all at once.
         share = min(robots, 4) if wp.get_device(self._device).is_cpu else robots
         self._chunks = [slice(i, min(i + share, robots)) for i in range(0, robots, share)]
@@ -47,6 +52,10 @@ class SafetyFilter:
 
     def select(self, robots: torch.Tensor) -> None:
         """Keep only ``robots`` (indices), in that order, with their past."""
+        if robots.ndim != 1 or robots.is_floating_point() or robots.dtype == torch.bool:
+            raise RomnavError(f"robots are {robots.dtype} {tuple(robots.shape)}; expected indices, integers (K,)")
+        if len(robots) and (robots.min() < 0 or robots.max() >= self._robots):
+            raise RomnavError(f"robots are {robots.tolist()}; the filter has {self._robots}")
         rasterizers, solvers = zip(*self._stages, strict=True)
         self._prepare(len(robots))
         for chunk, (rasterizer, solver) in zip(self._chunks, self._stages, strict=True):
@@ -55,6 +64,10 @@ class SafetyFilter:
 
     def reset(self, robots: torch.Tensor | None = None) -> None:
         """Forget the past of ``robots`` (bool mask; all by default), as after a jump to another place."""
+        if robots is not None and (robots.dtype != torch.bool or robots.shape != (self._robots,)):
+            raise RomnavError(
+                f"robots are {robots.dtype} {tuple(robots.shape)}; expected a mask, bool ({self._robots},)"
+            )
         for chunk, (rasterizer, solver) in zip(self._chunks, self._stages, strict=True):
             for part in (rasterizer, solver):
                 part.reset(None if robots is None else robots[chunk])
@@ -76,8 +89,12 @@ class SafetyFilter:
             motion: (B, 4) how the robots have moved (x, y, z) and turned since the last call, in their frame of
                 then, m and rad: what has left the field of view is then remembered for a while, else forgotten.
         """
-        if velocity.shape != (self._robots, 2):
-            raise RomnavError(f"velocity has shape {tuple(velocity.shape)}; expected ({self._robots}, 2)")
+        if velocity.shape != (self._robots, 2) or not velocity.is_floating_point():
+            raise RomnavError(
+                f"velocity is {velocity.dtype} {tuple(velocity.shape)}; expected floating point ({self._robots}, 2)"
+            )
+        if motion is not None and motion.shape != (self._robots, 4):
+            raise RomnavError(f"motion has shape {tuple(motion.shape)}; expected ({self._robots}, 4)")
         if points.ndim != 3 or len(points) != self._robots or (valid is not None and valid.shape != points.shape[:2]):
             raise RomnavError(
                 f"points are {tuple(points.shape)}, valid {None if valid is None else tuple(valid.shape)}; "

@@ -178,6 +178,8 @@ def _recall(
     half: float,
     cell: float,
     step: float,
+    height: float,
+    slope: float,
     calls: float,
     blind: float,
     travel: float,
@@ -185,7 +187,8 @@ def _recall(
 ):
     """Carry remembered returns into the frame of a robot that has moved, older by a call, or nearby by the way.
 
-    What is no higher than a step above the robot's feet is forgotten: a landing's edge is a ledge from below alone.
+    What is no higher than a step above the robot's feet is forgotten: a landing's edge is a ledge from below alone. So
+    is what a robot that has gone down would pass beneath, however steep the way to it.
     """
     b, i, j = wp.tid()
     packed = before[b, i, j]
@@ -197,7 +200,7 @@ def _recall(
     y = _unpack(packed, 0, 2.0 * half, _SHARE) - half - moved[1]
     z = _TOP - _unpack(packed, 32, _HEIGHTS, _DEPTH) - moved[2]
     age += wp.where(wp.length(wp.vec2(x, y)) <= blind, calls * way[b] / travel, 1.0)
-    if age >= calls or z <= step:
+    if age >= calls or z <= step or z > height + slope * wp.length(wp.vec2(x, y)):
         return
     c = wp.cos(moved[3])
     s = wp.sin(moved[3])
@@ -417,7 +420,7 @@ class Rasterizer:
             outputs=[lowest],
             device=device,
         )
-        if motion is not None:
+        if motion is not None and spec.memory > 1:
             motion = motion.float().contiguous()
             wp.launch(
                 _recall,
@@ -429,6 +432,8 @@ class Rasterizer:
                     half,
                     spec.cell,
                     spec.step,
+                    spec.height,
+                    spec.slope,
                     float(spec.memory),
                     spec.blind,
                     spec.travel,

@@ -1,4 +1,4 @@
-"""Depth images of the camera that looks down from the robot's head (paper, Sec. III-A)."""
+"""Depth images of the camera that looks down from the robot's head (paper, Sec. III-B)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The LiDAR of the robot: levelled range images of the solids of a tile (paper, Sec. III-A)."""
+"""The LiDAR of the robot: levelled range images of the solids of a tile (paper, Sec. III-B)."""
 
 from __future__ import annotations
 

@@ -67,6 +67,11 @@ class Pose(NamedTuple):
         return sensor.scan(self.tile, self.origin, self.yaw, labels=labels, tilt=self.tilt)
 
 
+def corrupter(spec: CorruptionSpec, seed: int, device: str = "cpu") -> Corruption:
+    """What corrupts images at the `Poses` of a seed: by numbers of its own, so that it tells nothing of a pose."""
+    return Corruption(spec, seed + 2_000_003, device)
+
+
 class Poses:
     """Random poses of a sensor, half anywhere, half on or near stairs and ramps; a function of their index.
 
@@ -223,7 +228,7 @@ class _Training:
         self._optimizer = torch.optim.AdamW(
             self._parameters, spec.learning_rate, weight_decay=spec.weight_decay, foreach=True
         )
-        self._corrupt = Corruption(spec.corruption, spec.seed, device)
+        self._corrupt = corrupter(spec.corruption, spec.seed, device)
         self._per_epoch = max(spec.images // spec.batch, 1)
         self.steps = self._per_epoch * spec.epochs
         self.step = 0
@@ -338,13 +343,13 @@ def quality(
     Returns:
         ``images``, ``iou`` by class, ``depth_mae_m``, ``depth_rmse_m``, ``xyz_error_m`` (mean distance),
         ``valid_iou``, ``dead_dims``, ``latent_dims``, ``divergence_nat``; the errors by tile class in ``tiles``,
-        and all of it in ``dropout_50``.
+        and all of it in ``dropout_50``. An error is None where nothing was there to be seen.
     """
     poses = Poses([grids for _, grids in tiles], height, seed, device, sway)
     kinds = np.array([tile.kind for tile, _ in tiles])
     result: dict[str, Any] = {"images": images}
     for share in (0.0, 0.5):
-        corrupt = Corruption(corruption.model_copy(update={"dropout": (share, share)}), seed, device)
+        corrupt = corrupter(corruption.model_copy(update={"dropout": (share, share)}), seed, device)
         sums, means, nats = {str(kind): _Errors(model.encoder.spec.cartesian) for kind in sorted(set(kinds))}, [], []
         for index in torch.arange(images, device=device).split(256):
             pose = poses(index)
@@ -402,7 +407,7 @@ class _Errors:
         return {
             "iou": {label.name.lower(): value for label, value in zip(Label, iou, strict=False)},
             "valid_iou": iou[-1],
-            "depth_mae_m": round(absolute / count, 4),
-            "depth_rmse_m": round(math.sqrt(squared / count), 4),
-            "xyz_error_m": round(xyz / count, 4) if self.cartesian else None,
+            "depth_mae_m": round(absolute / count, 4) if count else None,
+            "depth_rmse_m": round(math.sqrt(squared / count), 4) if count else None,
+            "xyz_error_m": round(xyz / count, 4) if self.cartesian and count else None,
         }

@@ -20,7 +20,7 @@ Stride = Annotated[int, Field(ge=1, le=16)]
 
 
 class LidarSpec(Config):
-    """Range image of a Livox Mid-360 in the head of a G1, binned after levelling (paper, Sec. III-A)."""
+    """Range image of a Livox Mid-360 in the head of a G1, binned after levelling (paper, Sec. III-B)."""
 
     rows: Pixels = 59
     """Pixels in elevation; 59 are 1 degree each (P: the degree; A: the number, from ``elevation``)."""
@@ -36,8 +36,8 @@ class LidarSpec(Config):
     """Pitch of the sensor, which is mounted upside down, in the torso, rad (A: G1 URDF)."""
     field: Range[Elevation] = (-7.0, 52.0)
     """Vertical field in the sensor's own frame, degrees (A: Mid-360 data sheet)."""
-    min_range: NonNegative = 0.1
-    """Nearest return, m (A: Mid-360 data sheet)."""
+    min_range: float = Field(default=0.1, ge=0.001, le=1e6)
+    """Nearest return, m (A: Mid-360 data sheet). Above rounding, so that a ray that starts in a solid has none."""
     max_range: Positive = 30.0
     """Farthest return, m (A: as far as goals of training lie; a Mid-360 sees surfaces of 10 % albedo at 40 m)."""
     backend: Literal["columns", "mesh"] = "columns"
@@ -54,7 +54,7 @@ class LidarSpec(Config):
 
 
 class DepthSpec(Config):
-    """Depth image of a ZED Mini in the head of a G1, looking down (paper, Sec. III-A)."""
+    """Depth image of a ZED Mini in the head of a G1, looking down (paper, Sec. III-B)."""
 
     rows: Pixels = 26
     """Pixels downwards (P)."""
@@ -86,7 +86,8 @@ class CorruptionSpec(Config):
     """What is done to clean range images (paper, "Pretraining Vision Encoders")."""
 
     noise: tuple[NonNegative, NonNegative, NonNegative] = (0.02, 0.001, 0.0)
-    """Standard deviation of a range r, ``n0 + n1 r + n2 r^2``, m (A: Mid-360 data sheet, 2 cm at 10 m)."""
+    """Standard deviation of a range r, ``n0 + n1 r + n2 r^2``, m (A: 3 cm at 10 m, half as much again as
+    the Mid-360's data sheet has, and growing as its beam widens)."""
     dropout: Range[Share] = (0.0, 0.8)
     """Least and largest share of lost pixels (P; A: each image draws its own)."""
     occlusion: tuple[tuple[Share, Share, Share, Share], ...] = (
@@ -226,7 +227,7 @@ class DepthPretrainSpec(PretrainSpec):
 class QualitySpec(Config):
     """Judging an encoder on tiles that it was not trained on."""
 
-    images: Count = 4096
+    images: int = Field(default=4096, ge=2, le=2**31)
     """Images, posed as in training (A: a per-mille of a class moves its IoU by less than the seed does)."""
     tiles: int = Field(default=64, ge=1, le=2**16)
     """Tiles (A)."""

@@ -105,5 +105,20 @@ def test_mistakes_are_named():
     filter_ = SafetyFilter(2)
     with pytest.raises(RomnavError, match="points are"):
         filter_(torch.zeros(3, 5, 3), torch.zeros(2, 2))
-    with pytest.raises(RomnavError, match="velocity has shape"):
-        filter_(torch.zeros(2, 5, 3), torch.zeros(2, 3))
+    points, velocity = torch.zeros(2, 5, 3), torch.zeros(2, 2)
+    for wrong in (torch.zeros(2, 3), torch.zeros(2, 2, dtype=torch.int64)):
+        with pytest.raises(RomnavError, match=r"velocity is .* expected floating point \(2, 2\)"):
+            filter_(points, wrong)
+    with pytest.raises(RomnavError, match=r"motion has shape \(7, 4\); expected \(2, 4\)"):
+        filter_(points, velocity, motion=torch.zeros(7, 4))
+    for mask in (torch.tensor([1]), torch.tensor([True])):
+        with pytest.raises(RomnavError, match="expected a mask"):
+            filter_.reset(mask)
+    for keep in (torch.tensor([True, False]), torch.tensor(1)):
+        with pytest.raises(RomnavError, match="expected indices"):
+            filter_.select(keep)
+    with pytest.raises(RomnavError, match=r"robots are \[2\]; the filter has 2"):
+        filter_.select(torch.tensor([2]))
+    for none in (lambda: SafetyFilter(0), lambda: filter_.select(torch.tensor([], dtype=torch.int64))):
+        with pytest.raises(RomnavError, match="of 0 robots"):
+            none()

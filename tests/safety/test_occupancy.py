@@ -309,6 +309,33 @@ def test_a_ledge_is_none_any_more_once_climbed():
     assert again.nonzero().tolist() == [[70, 64]]
 
 
+def test_what_a_robot_that_went_down_passes_beneath_is_none_any_more():
+    rasterizer = Rasterizer(1, OccupancySpec())
+    floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()
+    seen = torch.tensor([[0.62, 0.0, 1.0], [0.62, 0.42, 0.4]])  # a landing's edge to be, and a post
+    assert rasterizer(torch.cat([floor, seen])[None]).occupied[0].nonzero().tolist() == [[72, 60], [72, 68]]
+    down = torch.tensor([[0.0, 0.0, -0.9, 0.0]])
+    lowered = rasterizer(floor[None], motion=down).occupied[0]
+    assert lowered.nonzero().tolist() == [[72, 68]]
+    afresh = torch.cat([floor, seen - down[0, :3]])[None]  # seen from there, no more and no less is in the way
+    assert torch.equal(Rasterizer(1, OccupancySpec())(afresh).occupied[0], lowered)
+
+
+def test_up_a_stair_what_is_higher_than_the_robot_is_remembered():
+    rasterizer = Rasterizer(1, OccupancySpec())
+    stair = torch.from_numpy(patch((-3, 3), (-3, 3), lambda x: 0.6 * np.maximum(x, 0.0))).float()
+    post = torch.tensor([[2.02, 0.0, 1.2 + 1.2]])
+    assert rasterizer(torch.cat([stair, post])[None]).occupied[0, 100, 60]
+    assert rasterizer(stair[None], motion=torch.zeros(1, 4)).occupied[0, 100, 60]
+
+
+def test_a_memory_of_one_call_is_none():
+    rasterizer = Rasterizer(1, OccupancySpec(memory=1))
+    floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()[None]
+    assert rasterizer(torch.cat([floor, torch.tensor([[[0.5, 0.0, 0.4]]])], dim=1)).occupied.any()
+    assert not rasterizer(floor, motion=torch.zeros(1, 4)).occupied.any()
+
+
 def test_without_motion_nothing_is_remembered():
     rasterizer = Rasterizer(3, OccupancySpec())
     floor = torch.from_numpy(patch((-3, 3), (-3, 3), flat)).float()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from romnav.sensing import encoder as checkpoints
 from romnav.sensing.depth import DepthCamera
 from romnav.sensing.encoder import Autoencoder
 from romnav.sensing.lidar import Lidar
-from romnav.sensing.pretrain import TERMS, Poses, divergence, loss_terms, pretrain, quality
+from romnav.sensing.pretrain import TERMS, Poses, corrupter, divergence, loss_terms, pretrain, quality
 from romnav.sensing.spec import (
     UPRIGHT,
     WALKING,
@@ -126,6 +127,23 @@ def test_poses_are_half_near_connectors_and_stand_on_the_surface(tiles: list[tup
     assert turned.min() > 400
     again = poses(index[100:200])
     assert torch.equal(again[1], origin[100:200])
+
+
+def test_the_mask_of_the_head_tells_nothing_of_the_pose(tiles: list[tuple[Tile, Grids]]) -> None:
+    """Nodes lie row by row, so that the one which is drawn tells of the place."""
+    index, box, nothing = torch.arange(4000), (0.3, 0.7, 0.3, 0.7), (0.0, 0.0, 0.0, 0.0)
+    poses = Poses([tiles[0][1]], HEIGHT, 3, sway=WALKING)(index)
+    drawn = torch.stack([*poses.origin.T, poses.yaw, *poses.tilt.T])
+    for boxes in ((box,), (nothing, box), (nothing, nothing, box)):  # four random numbers each
+        spec = CorruptionSpec(noise=(0.0, 0.0, 0.0), dropout=(0.0, 0.0), occlusion=boxes, occlusion_jitter=0.1)
+        lost = corrupter(spec, 3)(torch.ones(4000, 60, 60), index, index) == 0
+        lost[:, :8] = lost[:, :, :8] = False  # what the jitter makes of nothing
+        columns, rows = lost.any(1).int(), lost.any(2).int()
+        edges = torch.stack([columns.argmax(1), columns.flip(1).argmax(1), rows.argmax(1), rows.flip(1).argmax(1)])
+        assert (edges.float().std(1) > 2).all()
+        for half in (index % 2 == 0, index % 2 == 1):
+            seen = torch.cat([edges, drawn])[:, half].double()
+            assert torch.corrcoef(seen)[:4, 4:].abs().max() < 0.1
 
 
 def test_a_walking_head_is_lower_and_leans(tiles: list[tuple[Tile, Grids]]) -> None:
@@ -280,6 +298,16 @@ def test_quality_of_a_known_model(tiles: list[tuple[Tile, Grids]], lidar: Lidar)
     cells = model.encoder.map_shape[0] * model.encoder.map_shape[1]
     assert found["dead_dims"] == cells
     assert found["tiles"]["outdoor"]["depth_mae_m"] == found["depth_mae_m"] == found["dropout_50"]["depth_mae_m"]
+
+
+def test_a_class_of_tiles_that_no_image_is_of_has_no_errors(tiles: list[tuple[Tile, Grids]]) -> None:
+    (tile, grids) = tiles[0]
+    three = [(replace(tile, kind=kind), grids) for kind in "abc"]
+    lidar = Lidar([tile.solids] * 3, LidarSpec(rows=15, columns=31))
+    found = quality(Autoencoder(SPEC.encoder, lidar.directions), three, lidar, HEIGHT, CorruptionSpec(), images=2)
+    errors = [found["tiles"][kind]["depth_mae_m"] for kind in "abc"]
+    assert None in errors
+    assert found["depth_mae_m"] == pytest.approx(np.mean([e for e in errors if e is not None]), rel=0.3)
 
 
 def test_the_depth_camera_learns_by_the_same_code(tiles: list[tuple[Tile, Grids]], tmp_path: Path) -> None:

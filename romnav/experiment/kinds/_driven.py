@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from romnav.robot.dynamics import Body
     from romnav.world.world import World
 
-NOISE, GUARD_NOISE = 1, 1000
-"""Seeds of the sensor noise in evaluation, the policy's and the safety filter's: every arm meets the same noise in the
-same step of an episode."""
+NOISE, GUARD_NOISE, GAIT_NOISE = 1, 1000, 0
+"""Seeds in evaluation, whatever the training seed: of the sensors' noise, the policy's and the safety filter's, so that
+every arm meets the same noise in the same step of an episode, and of the gait in which a humanoid starts."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Driven:
     def body(self, device: str) -> Body:
         """What makes the robots, behind the safety filter if it guards them."""
         settings = self.settings
-        made = body(self.work, settings, self.seed, device, settings.evaluation.threads)
+        made = body(self.work, settings, GAIT_NOISE, device, settings.evaluation.threads)
         if not self.filtered:
             return made
         from romnav.evaluation.shield import Guarded

@@ -13,7 +13,7 @@ from romnav import files
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session, Stage
-from romnav.experiment.kinds._driven import NOISE
+from romnav.experiment.kinds._driven import GAIT_NOISE, NOISE
 from romnav.experiment.kinds.locomotion import body
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.workspace import Workspace
@@ -156,7 +156,7 @@ def _judge(
         if iteration in rows and rows[iteration]["policy"] == name:
             continue
         driver = Policy(checkpoint.load_actor(file, seen.encoder, session.device, depth_encoder=depth), seen)
-        robots = body(work, settings, trained.seed or 0, session.device, settings.evaluation.threads)
+        robots = body(work, settings, GAIT_NOISE, session.device, settings.evaluation.threads)
         env, spec = settings.navigation.env, settings.evaluation
         saved = checkpoint.read(file)
         place = {"policy": name, "conditions": conditions, "iteration": iteration}

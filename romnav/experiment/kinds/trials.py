@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import romnav.world.scenes
 from romnav.errors import NothingRecorded, RomnavError
 from romnav.experiment.graph.stage import Session, Stage
-from romnav.experiment.kinds._driven import Driven
+from romnav.experiment.kinds._driven import GAIT_NOISE, Driven
 from romnav.experiment.kinds.locomotion import humanoid
 from romnav.experiment.spec import SCRIPTED, TrialKind
 from romnav.experiment.workspace import Workspace
@@ -84,7 +84,7 @@ def _run(driven: Driven, kind: TrialKind, stage: Stage, session: Session, progre
         settings.navigation.env,
         spec,
         progress,
-        body=humanoid(driven.work, settings, driven.seed, session.device, spec.threads) if walks else None,
+        body=humanoid(driven.work, settings, GAIT_NOISE, session.device, spec.threads) if walks else None,
         arms=settings.locomotion.robot if walks else None,
     )
     rows.write(stage.folder / stage.outputs[0], rows.TrialRows(driven.arm, driven.seed, columns, provenance))
