@@ -1,4 +1,4 @@
-"""Procedural generators of the tile classes (paper, Sec. IV-A, Environments)."""
+"""Procedural generators of the tile classes (paper, Sec. III-D, Environments)."""
 
 from romnav.world.tiles.generate import fault, generate
 

@@ -1,4 +1,4 @@
-"""From a spec and an index to a checked tile (paper, Sec. IV-A, Environments)."""
+"""From a spec and an index to a checked tile (paper, Sec. III-D, Environments)."""
 
 from __future__ import annotations
 
