@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,6 +42,23 @@ def test_joints_are_kept_of_humanoids_only(project: Path) -> None:
     assert fails("eval", "oracle", "--joints") == message
     assert fails("eval", "--paired", "--joints").startswith("--joints: are those of evaluated arms; name arms")
     assert fails("eval", "rom", "--kept", "--joints").startswith("--joints: are those of evaluated arms; name arms")
+
+
+@pytest.mark.parametrize("size", [30, 400])
+def test_damaged_rows_of_kept_policies_are_one_clear_error(project: Path, size: int) -> None:
+    """They are here, their policies on another machine."""
+    shutil.copytree(ROOT / "results" / "cpu" / "rom", project / "results" / "cpu" / "rom")
+    file = project / "results" / "cpu" / "rom" / "seed-0" / "kept.csv"
+    words = ("eval", "rom", "--kept", "--seed", "0", "--scale", "cpu")
+    assert romnav(*words).exit_code == 0
+    file.write_bytes(file.read_bytes()[:size])
+    result = romnav(*words)
+    assert result.exit_code == 1
+    message = f"error: {file}: not the file that kept.json recorded (truncated, edited); restore it, or delete it and "
+    assert result.stderr.splitlines()[-1] == f"{message}judge the kept policies again"
+    assert not result.stdout
+    drawn = romnav("tables", "spawn-goal", "--scale", "cpu")
+    assert (drawn.exit_code, drawn.stderr.splitlines()[-1]) == (1, f"{message}judge the kept policies again")
 
 
 def test_results_are_printed_for_people_and_for_scripts(evaluated: Path) -> None:

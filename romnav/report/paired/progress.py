@@ -10,7 +10,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from romnav.errors import RomnavError
 from romnav.report.formats import literal
 from romnav.report.lines import styles
 
@@ -36,19 +35,6 @@ def slope(runs: Sequence[pd.DataFrame], rate: str) -> float:
         for columns in ([np.log2(run["steps"].to_numpy(float)) for run in runs], [run[rate] for run in runs])
     )
     return float(x @ y / (x @ x)) if x.any() else float("nan")
-
-
-def read(path: Path) -> pd.DataFrame:
-    """Rows of ``kept.csv``.
-
-    Raises:
-        RomnavError: The file is damaged.
-    """
-    try:
-        rows = pd.read_csv(path)
-        return rows.astype({name: float for name in rows.columns if name.startswith(("sr_", "steps"))})
-    except (OSError, ValueError) as error:
-        raise RomnavError(f"{path}: damaged ({error}); delete it and judge the kept policies again") from error
 
 
 def draw(arms: Mapping[str, Sequence[pd.DataFrame]], path: Path) -> None:
