@@ -27,8 +27,16 @@ def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> Non
 
 def test_the_navigation_test_is_of_the_locomotion_policy_and_needs_rom(project: Path) -> None:
     assert fails("eval", "rom", "--navigation").startswith("--navigation: a test of the locomotion policy")
+    assert fails("eval", "rom", "--kept", "--navigation").startswith("--navigation: a test of the locomotion policy")
     message = fails("eval", "locomotion", "--navigation")
     assert "policy rom, seed 0 is missing, and navigation test needs it" in message
+
+
+@pytest.mark.parametrize("words", [("--seed", "0"), ("--joints",), ("--paired",)], ids=" ".join)
+def test_options_of_arms_are_none_of_the_locomotion_test(project: Path, words: tuple[str, ...]) -> None:
+    message = f"{words[0]}: is of arms, and locomotion is none; leave it out, or name an arm, too"
+    assert fails("eval", "locomotion", *words) == message
+    assert "locomotion is missing, and terrain test needs it" in fails("eval", "locomotion", "oracle", "--seed", "0")
 
 
 def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
@@ -85,6 +93,8 @@ def test_what_cannot_be_compared_is_one_clear_error(project: Path) -> None:
     assert fails("eval", "rom", "uniform", "rom") == "rom is named twice; name each arm once"
     assert fails("eval", "--paired", "rom").startswith("--paired compares arms: name one beside rom, or none")
     assert fails("eval", "--paired", "--generalization").startswith("--generalization: is of each arm by itself")
+    for option in ("--paired", "--all-pairs", "--verbose"):
+        assert fails("eval", "rom", "--kept", option).startswith("--kept: is of each arm by itself; leave --paired, ")
     assert "policy rom, seed 0 is missing, and generalization" in fails("eval", "rom", "--generalization")
     assert fails("eval").startswith("name arms, or compare all that are trained by `romnav eval --paired`")
     assert fails("eval", "--paired").endswith("no arm is trained; run `romnav run ablation spawn-goal --scale smoke`")
