@@ -37,10 +37,11 @@ def world(
     from romnav.progress import bar
     from romnav.report.difficulty_figure import draw_difficulty
 
+    at.project.experiment(experiment)  # its name is that of a file
+    path = at.picture(out, f"describe-{experiment}.png")
     with bar("world") as progress:
         described = describe_world(at.work, experiment, progress)
     told = described.plain()
-    path = at.picture(out, f"describe-{experiment}.png")
     draw_difficulty(described.difficulty.goals, path)
     if as_json:
         typer.echo(json.dumps(told, indent=2))

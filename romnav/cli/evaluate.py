@@ -132,21 +132,26 @@ def evaluate(
         raise RomnavError("--joints: are those of evaluated arms; name arms on the humanoid, without --kept")
     if generalization and (along or paired or joints):
         raise RomnavError("--generalization: is of each arm by itself; leave --kept, --paired and --joints out")
+    if along and paired:
+        raise RomnavError("--kept: is of each arm by itself; leave --paired, --all-pairs and --verbose out")
+    if navigation and "locomotion" not in names:
+        raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
     if along:
         _judge_kept(job, names, seed)
         return
     if generalization:
         _judge_seen(job, names, seed)
         return
-    if navigation and "locomotion" not in names:
-        raise RomnavError("--navigation: a test of the locomotion policy; run `romnav eval locomotion --navigation`")
-    if "locomotion" in names:
-        (_test_navigation if navigation else _test_terrain)(job)
-        names = [name for name in names if name != "locomotion"]
-        if not names:
-            return
+    tested, names = "locomotion" in names, [name for name in names if name != "locomotion"]
+    if tested and not names and (joints or paired or seed is not None):
+        key = "--joints" if joints else "--paired" if paired else "--seed"
+        raise RomnavError(f"{key}: is of arms, and locomotion is none; leave it out, or name an arm, too")
     if paired and len(names) == 1:
         raise RomnavError(f"--paired compares arms: name one beside {names[0]}, or none for all that are trained")
+    if tested:
+        (_test_navigation if navigation else _test_terrain)(job)
+        if not names:
+            return
     stages = _of_arms(job, names, seed, joints) if names else _of_trained_arms(job, seed)
     for stage in stages:
         driver = job.project.driver(str(stage.arm))

@@ -17,9 +17,11 @@ def export(
     job: Job,
     arm: ArmArgument,
     seed: SeedOption = None,
-    onnx: Annotated[bool, typer.Option("--onnx", help="As ONNX, with its encoders and a card of metadata.")] = True,
+    onnx: Annotated[bool, typer.Option("--onnx", hidden=True)] = False,
 ) -> None:
-    """Write the trained policy of an arm as one file for a robot, checked against PyTorch over 1,000 steps."""
+    """Write the trained policy of an arm, its encoders and a card of metadata as one ONNX file for a robot, checked
+    against PyTorch over 1,000 steps."""
+    # ONNX is the only format: --onnx asks for what is done anyway, as commands written down so far do
     from romnav.experiment.graph.run import require
     from romnav.experiment.kinds.export import export
 

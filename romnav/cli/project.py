@@ -72,7 +72,7 @@ def episodes(
     count: Annotated[int, typer.Option(help="Episodes.", min=1)] = 1024,
 ) -> None:
     """Draw a new set of paired episodes; existing ones are never replaced."""
-    from romnav import config
+    from romnav import config, files
     from romnav.evaluation import episodes
     from romnav.evaluation.spec import EpisodeSetSpec
     from romnav.world.build import build
@@ -83,6 +83,7 @@ def episodes(
         raise RomnavError(f"episode set {error}") from error
     if path.exists():
         raise RomnavError(f"{path}: exists, and results refer to it; choose another name")
+    files.prepare(path)
     paper = EpisodeSetSpec()
     world = paper.world.model_copy(update={"seed": seed, "tiles": tiles})
     spec = EpisodeSetSpec(world=world, episodes=count, cross=count * paper.cross // paper.episodes, seed=seed)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from romnav import files
 from romnav.cli.app import app
 from romnav.cli.options import AtScale, arms, command
 
@@ -26,6 +27,7 @@ def report(
     from romnav.experiment.kinds.page import write
 
     path = out or at.work.folder / "report.html"
+    files.prepare(path)
     for note in write(at.work, names or [], path):
         typer.echo(f"note: {note}", err=True)
     typer.echo(path)

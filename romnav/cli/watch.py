@@ -32,6 +32,8 @@ def watch(
 
     from romnav.experiment.watch import runs
 
+    for name in names or ():
+        at.project.having(name)  # refuses what is no arm to train
     found = runs(at.work, names or ())
     if not found:
         raise NothingRecorded(f"{at.work.folder}: no training run has begun; run `romnav train policy ARM`")

@@ -86,7 +86,7 @@ class RowFile:
         Raises:
             RomnavError: The file is missing, damaged, of another schema, or not what the record beside it tells of.
         """
-        self._check_record(path)
+        check_record(path, self.again)
         try:
             table = pq.ParquetFile(path, page_checksum_verification=True).read()
         except FileNotFoundError as error:
@@ -109,21 +109,6 @@ class RowFile:
             raise RomnavError(f"{path}: provenance key {key}: {error.errors()[0]['msg']}; {self.again}") from error
         return table, provenance, {fact: about[fact] for fact in facts}
 
-    def _check_record(self, path: Path) -> None:
-        """Compares a file with the digest in the record beside it; without a record, rows stand for themselves."""
-        record = path.with_suffix(".json")
-        try:
-            recorded = json.loads(record.read_text("utf-8"))["outputs"].get(path.name)
-        except FileNotFoundError:
-            return
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise RomnavError(f"{record}: damaged record; restore it, or delete it and {self.again}") from error
-        if recorded and path.exists() and files.digest(path) != recorded:
-            raise RomnavError(
-                f"{path}: not the file that {record.name} recorded (truncated, edited); restore it, or delete it and "
-                f"{self.again}"
-            )
-
     def require(self, columns: Mapping[str, NDArray], holds: Mapping[str, NDArray], source: str, row: str) -> None:
         """Checks that what must hold of a column does, row by row; of the outcomes it always is the same.
 
@@ -143,3 +128,27 @@ class RowFile:
                 worst = int(np.argmin(ok))
                 value = columns[name][worst]
                 raise RomnavError(f"{source}: {row} {worst} has an impossible {name} ({value}); {self.again}")
+
+
+def check_record(path: Path, again: str) -> None:
+    """Compares a file with the digest in the record beside it; without a record, rows stand for themselves.
+
+    Args:
+        path: The file; its record has its name and ends with ``.json``.
+        again: What to do where it is another one.
+
+    Raises:
+        RomnavError: The file is not the recorded one, or the record is damaged.
+    """
+    record = path.with_suffix(".json")
+    try:
+        recorded = json.loads(record.read_text("utf-8"))["outputs"].get(path.name)
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RomnavError(f"{record}: damaged record; restore it, or delete it and {again}") from error
+    if recorded and path.exists() and files.digest(path) != recorded:
+        raise RomnavError(
+            f"{path}: not the file that {record.name} recorded (truncated, edited); restore it, or delete it and "
+            f"{again}"
+        )

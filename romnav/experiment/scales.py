@@ -120,6 +120,18 @@ class Scale(Config):
         return self.model_copy(update={"navigation": self.navigation.model_copy(update=other)})
 
 
+def find(folder: Path, name: str) -> Path:
+    """The file of a scale among those in a folder.
+
+    Raises:
+        RomnavError: There is no such scale.
+    """
+    known = {file.stem: file for file in folder.glob("*.toml")}
+    if name not in known:
+        raise RomnavError(f"unknown scale {name}{suggest(name, known)}")
+    return known[name]
+
+
 class ScaleFile:
     """A scale, and what becomes of it when an arm changes some of its settings.
 
@@ -128,10 +140,7 @@ class ScaleFile:
     """
 
     def __init__(self, folder: Path, name: str) -> None:
-        known = {file.stem: file for file in folder.glob("*.toml")}
-        if name not in known:
-            raise RomnavError(f"unknown scale {name}{suggest(name, known)}")
-        self._file = file = known[name]
+        self._file = file = find(folder, name)
         self.name = name
         self._data = read_toml(file)
         self._bodies = parse(Scale, self._data, file).bodies

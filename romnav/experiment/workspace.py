@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from romnav.experiment.project import Project
-from romnav.experiment.scales import Scale, ScaleFile
+from romnav.experiment.scales import Scale, ScaleFile, find
 
 
 @dataclass(frozen=True)
@@ -15,16 +15,23 @@ class Workspace:
     """A project at one scale.
 
     Raises:
-        RomnavError: There is no such scale, or its file is invalid; where it is first needed.
+        RomnavError: There is no such scale; its file is invalid, where a setting is first needed.
     """
 
     project: Project
     scale: str
     """Name of the scale."""
 
+    def __post_init__(self) -> None:
+        find(self._scales, self.scale)  # what only reads results asks for no setting
+
+    @property
+    def _scales(self) -> Path:
+        return self.project.root / "experiments" / "scales"
+
     @cached_property
     def _file(self) -> ScaleFile:
-        return ScaleFile(self.project.root / "experiments" / "scales", self.scale)
+        return ScaleFile(self._scales, self.scale)
 
     @property
     def settings(self) -> Scale:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.statistics import Estimate
 from romnav.report.formats import Block, Cell, Row, Table, literal, number
+from romnav.report.lines import styles
 from romnav.report.spec import Published
 
 SHARE = 0.1
 """Part of the run over which success is averaged: a trailing window in the figure, the last one in the table."""
 RESAMPLES = 10_000
-COLOURS = ("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b")
 NEEDED = ("iteration", "steps", "cpu_seconds", "episodes", "success")
 
 
@@ -124,13 +124,13 @@ def draw(arms: Mapping[str, Curves], path: Path) -> None:
     """Draw mean and min-max band over seeds of every arm's success rate; save to ``path`` (type by its suffix)."""
     figure = Figure(figsize=(6.4, 3.9), layout="constrained")
     axes = figure.add_subplot()
-    for colour, curves in zip(COLOURS, arms.values(), strict=False):
+    for curves, (colour, dashes) in zip(arms.values(), styles(), strict=False):
         rates = curves.smooth()
         iteration = np.arange(1, curves.iterations + 1)
         shown = np.isfinite(rates).all(axis=0)
         iteration, rates = iteration[shown], rates[:, shown]
         axes.fill_between(iteration, rates.min(axis=0), rates.max(axis=0), color=colour, alpha=0.2, linewidth=0)
-        axes.plot(iteration, rates.mean(axis=0), color=colour, label=literal(curves.label))
+        axes.plot(iteration, rates.mean(axis=0), color=colour, linestyle=dashes, label=literal(curves.label))
         if 0.0 < curves.unfreeze_at < 1.0:
             axes.axvline(round(curves.unfreeze_at * curves.iterations), color=colour, linestyle=":", linewidth=1)
     axes.set(xlabel="iteration", ylabel="success while training (%)", ylim=(0, None), xlim=(0, None))

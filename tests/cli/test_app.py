@@ -99,3 +99,10 @@ def test_control_c_says_how_to_go_on(project: Path, monkeypatch: pytest.MonkeyPa
     result = romnav("train", "encoder", "--no-resume")
     assert result.exit_code == 130
     assert result.stderr.splitlines()[-1] == "stopped; what is done is kept, go on with: romnav train encoder"
+
+
+def test_an_export_is_onnx_be_it_asked_for_or_not(project: Path) -> None:
+    told = romnav("export", "--help").stdout
+    assert ("ONNX" in told, "--onnx" in told) == (True, False)
+    assert "policy rom, seed 0 is missing" in (message := fails("export", "rom"))
+    assert fails("export", "rom", "--onnx") == message

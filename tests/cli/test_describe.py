@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from romnav.experiment import describe
 from romnav.experiment.scales import ScaleFile
 from romnav.navigation.env import NavigationEnv
 from romnav.navigation.ppo import make_ppo
@@ -52,6 +53,17 @@ def test_a_world_is_described_for_every_sampler_of_an_experiment(small: Path) ->
     assert "frozen" in again.stdout
     assert "scratch" not in again.stdout  # the same sampler as the first arm's
     assert (small / "here.png").exists()
+
+
+def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_built(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (small / "file").touch()
+    monkeypatch.setattr(describe, "build", None)
+    message = fails("describe", "world", "--scale", "mine", "--out", "file/here.png")
+    assert message.startswith("file/here.png: cannot be written (file exists)")
+    assert fails("describe", "world", "--scale", "mine", "--experiment", "../x").startswith("unknown experiment ../x")
+    assert not (small / "results").exists()
 
 
 def test_a_bad_world_is_one_line_before_anything_is_built(small: Path) -> None:

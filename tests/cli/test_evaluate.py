@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,8 +27,16 @@ def test_a_missing_locomotion_policy_says_how_to_train_one(project: Path) -> Non
 
 def test_the_navigation_test_is_of_the_locomotion_policy_and_needs_rom(project: Path) -> None:
     assert fails("eval", "rom", "--navigation").startswith("--navigation: a test of the locomotion policy")
+    assert fails("eval", "rom", "--kept", "--navigation").startswith("--navigation: a test of the locomotion policy")
     message = fails("eval", "locomotion", "--navigation")
     assert "policy rom, seed 0 is missing, and navigation test needs it" in message
+
+
+@pytest.mark.parametrize("words", [("--seed", "0"), ("--joints",), ("--paired",)], ids=" ".join)
+def test_options_of_arms_are_none_of_the_locomotion_test(project: Path, words: tuple[str, ...]) -> None:
+    message = f"{words[0]}: is of arms, and locomotion is none; leave it out, or name an arm, too"
+    assert fails("eval", "locomotion", *words) == message
+    assert "locomotion is missing, and terrain test needs it" in fails("eval", "locomotion", "oracle", "--seed", "0")
 
 
 def test_an_untrained_arm_is_not_evaluated(project: Path) -> None:
@@ -41,6 +50,23 @@ def test_joints_are_kept_of_humanoids_only(project: Path) -> None:
     assert fails("eval", "oracle", "--joints") == message
     assert fails("eval", "--paired", "--joints").startswith("--joints: are those of evaluated arms; name arms")
     assert fails("eval", "rom", "--kept", "--joints").startswith("--joints: are those of evaluated arms; name arms")
+
+
+@pytest.mark.parametrize("size", [30, 400])
+def test_damaged_rows_of_kept_policies_are_one_clear_error(project: Path, size: int) -> None:
+    """They are here, their policies on another machine."""
+    shutil.copytree(ROOT / "results" / "cpu" / "rom", project / "results" / "cpu" / "rom")
+    file = project / "results" / "cpu" / "rom" / "seed-0" / "kept.csv"
+    words = ("eval", "rom", "--kept", "--seed", "0", "--scale", "cpu")
+    assert romnav(*words).exit_code == 0
+    file.write_bytes(file.read_bytes()[:size])
+    result = romnav(*words)
+    assert result.exit_code == 1
+    message = f"error: {file}: not the file that kept.json recorded (truncated, edited); restore it, or delete it and "
+    assert result.stderr.splitlines()[-1] == f"{message}judge the kept policies again"
+    assert not result.stdout
+    drawn = romnav("tables", "spawn-goal", "--scale", "cpu")
+    assert (drawn.exit_code, drawn.stderr.splitlines()[-1]) == (1, f"{message}judge the kept policies again")
 
 
 def test_results_are_printed_for_people_and_for_scripts(evaluated: Path) -> None:
@@ -67,6 +93,8 @@ def test_what_cannot_be_compared_is_one_clear_error(project: Path) -> None:
     assert fails("eval", "rom", "uniform", "rom") == "rom is named twice; name each arm once"
     assert fails("eval", "--paired", "rom").startswith("--paired compares arms: name one beside rom, or none")
     assert fails("eval", "--paired", "--generalization").startswith("--generalization: is of each arm by itself")
+    for option in ("--paired", "--all-pairs", "--verbose"):
+        assert fails("eval", "rom", "--kept", option).startswith("--kept: is of each arm by itself; leave --paired, ")
     assert "policy rom, seed 0 is missing, and generalization" in fails("eval", "rom", "--generalization")
     assert fails("eval").startswith("name arms, or compare all that are trained by `romnav eval --paired`")
     assert fails("eval", "--paired").endswith("no arm is trained; run `romnav run ablation spawn-goal --scale smoke`")

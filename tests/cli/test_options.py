@@ -100,6 +100,14 @@ def test_an_episode_set_is_a_name_and_no_path(project: Path, name: str) -> None:
     assert "evaluation.episodes: " in fails("eval", "oracle")
 
 
+@pytest.mark.parametrize(
+    "words", [("results",), ("check",), ("watch", "--once"), ("report",), ("tables",), ("eval", "rom")], ids=" ".join
+)
+def test_a_scale_is_one_of_the_projects(project: Path, words: tuple[str, ...]) -> None:
+    assert fails(*words, "--scale", "smok") == "unknown scale smok; did you mean smoke?"
+    assert fails(*words, "--scale", "../..").startswith("unknown scale ../..")
+
+
 def test_a_hint_is_a_command_for_the_same_place(project: Path) -> None:
     where = ("--scale", "cpu", "--results", "else where")
     hint = "run `romnav train policy rom --seed 3 --scale cpu --results 'else where'`"

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+import pytest
+
+from romnav.world import build
 from tests.cli.conftest import edit, fails, romnav
 
 
@@ -44,3 +48,12 @@ def test_list_shows_the_others_beside_a_broken_file(evaluated: Path) -> None:
     assert romnav("results").exit_code == 0
     assert romnav("tables", "spawn-goal").exit_code == 0
     assert romnav("tables").stderr.splitlines()[-1] == f"error: {broken}: key title is missing"
+
+
+def test_an_episode_set_that_cannot_be_written_is_refused_before_it_is_drawn(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.rmtree(project / "experiments" / "episodes")
+    (project / "experiments" / "episodes").touch()
+    monkeypatch.setattr(build, "build", None)
+    assert "new.json: cannot be written (file exists)" in fails("episodes", "new")

@@ -1,7 +1,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import pytest
+
+from romnav.experiment.kinds import page
 from tests.cli.conftest import fails, romnav
 
 
@@ -31,3 +35,20 @@ def test_what_lies_among_results_and_is_none_is_noted(evaluated: Path) -> None:
 def test_mistakes_are_one_line(project: Path, evaluated: Path) -> None:
     assert "nothing is recorded; run `romnav run ablation" in fails("report", "--scale", "paper")
     assert "no such file of rows" in fails("report", "single-stage")
+
+
+@pytest.mark.parametrize(
+    ("out", "reason"), [("results", "is a folder"), ("a.html/report.html", "file exists"), (None, "is a folder")]
+)
+def test_a_page_that_cannot_be_written_is_refused_before_it_is_made(
+    evaluated: Path, monkeypatch: pytest.MonkeyPatch, out: str | None, reason: str
+) -> None:
+    (evaluated / "a.html").touch()
+    (evaluated / "results" / "smoke" / "report.html").mkdir()
+
+    def write(*_: Any) -> None:
+        raise AssertionError("the page was made")
+
+    monkeypatch.setattr(page, "write", write)
+    message = fails("report", *(("--out", out) if out else ()))
+    assert message.startswith(f"{out or evaluated / 'results' / 'smoke' / 'report.html'}: cannot be written ({reason})")

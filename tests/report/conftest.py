@@ -86,4 +86,4 @@ def _gallery(name: str, drawn: episodes.EpisodeSet, world: episodes.World) -> Ep
         episode_set=drawn.digest, version="0.1.0", steps=0, hours=0.0, machine="2 cores",
     )  # fmt: skip
     made = rows.make(columns, provenance, f"results/smoke/{name}/seed-0/episodes.parquet")
-    return EpisodeGallery(made, ways, drawn, world)
+    return EpisodeGallery(made, ways, drawn, world, EnvSpec().period)

@@ -10,9 +10,11 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from romnav.errors import RomnavError
 from romnav.report import curves, formats
+from romnav.report.lines import COLOURS
 from romnav.report.spec import Published
 
 ITERATIONS = 30
@@ -98,6 +100,20 @@ def test_the_figure_is_drawn(arms: dict[str, curves.Curves], tmp_path: Path) -> 
     image = matplotlib.image.imread(path)[..., :3]
     blank = (image == 1.0).all(axis=2).mean()
     assert 0.3 < blank < 0.99
+
+
+def test_every_arm_is_drawn_in_a_look_of_its_own(
+    arms: dict[str, curves.Curves], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: saved.append(figure))
+    labels = [f"arm {k}" for k in range(len(COLOURS) + 2)]
+    curves.draw({label: replace(arms["frozen"], label=label) for label in labels}, tmp_path / "curves.png")
+    (axes,) = saved[0].axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == labels
+    assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == len(labels)
 
 
 def test_curves_are_read_whole_or_refused(tmp_path: Path) -> None:

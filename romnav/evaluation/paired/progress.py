@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from romnav.errors import RomnavError
 from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.paired.failures import classify
 from romnav.evaluation.paired.metrics import LEVELS, evaluate
 from romnav.evaluation.paired.run import run
 from romnav.evaluation.rollout import Driver
+from romnav.evaluation.rowfile import check_record
 from romnav.evaluation.spec import EvaluationSpec
 from romnav.evaluation.tracks import Recorder
 from romnav.navigation.spec import EnvSpec
@@ -58,8 +60,37 @@ def row(columns: Mapping[str, NDArray]) -> dict[str, float]:
 
 
 def read(path: Path) -> list[dict[str, str]]:
-    """Rows of an earlier judgement; none where there is no such file, or one with other columns."""
-    if not path.exists():
-        return []
-    reader = csv.DictReader(io.StringIO(path.read_text("utf-8", errors="replace")))
-    return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
+    """Rows of an earlier judgement, at least one, by `COLUMNS`: whole numbers, numbers or NaN but for the digests.
+
+    Raises:
+        RomnavError: The file cannot be read, is damaged, or is not what the record beside it tells of.
+    """
+    again = "judge the kept policies again"
+    check_record(path, again)
+    try:
+        text = path.read_text("utf-8")
+        reader = csv.DictReader(io.StringIO(text))
+        rows = list(reader)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError("the first line does not name its columns")
+        if not rows or not text.endswith("\n"):
+            raise ValueError("truncated")
+        for number, row in enumerate(rows, 1):
+            _check(row, number)
+    except (OSError, ValueError, csv.Error) as error:
+        raise RomnavError(f"{path}: damaged ({error}); restore it, or delete it and {again}") from error
+    return rows
+
+
+def _check(row: Mapping[str | None, str | None], number: int) -> None:
+    if None in row:
+        raise ValueError(f"row {number} has more values than columns")
+    for column in COLUMNS:
+        value = row[column]
+        if not value:
+            raise ValueError(f"row {number} has no {column}")
+        try:
+            if column not in ("policy", "conditions"):
+                (int if column == "iteration" else float)(value)
+        except ValueError:
+            raise ValueError(f"row {number}: {column} is {value}, no number") from None

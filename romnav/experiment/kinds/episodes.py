@@ -153,10 +153,10 @@ def look_at(work: Workspace, arm: str, seed: int) -> EpisodeGallery:
     """
     from romnav.report.paired.gallery import EpisodeGallery
 
-    run = tabulate(work, arm, seed).run
-    tracks, postures, _ = read_ways(episodes(work, arm, seed).folder)
+    run, driven = tabulate(work, arm, seed).run, Driven.by(work, arm, seed)
+    tracks, postures, _ = read_ways(driven.folder)
     paired, world = ground(paired_set(work), work.project.worlds)
-    return EpisodeGallery(run, tracks, paired, world, postures)
+    return EpisodeGallery(run, tracks, paired, world, driven.settings.navigation.env.period, postures)
 
 
 def read_ways(folder: Path) -> tuple[Tracks, Postures | None, dict[str, str]]:

@@ -119,10 +119,12 @@ def _draw(
     """Of every training seed, the steps of what a run begins with included."""
     import pandas as pd
 
-    from romnav.report.paired.progress import draw, read
+    from romnav.evaluation.paired.progress import read
+    from romnav.report.paired.progress import draw
 
     def whole(kept: Path, begun: tuple[Stage, ...]) -> pd.DataFrame:
-        rows, found = read(kept), [record.facts for policy in begun if (record := records.read(policy))]
+        rows = pd.DataFrame(read(kept)).drop(columns=["policy", "conditions"]).astype(float)
+        found = [record.facts for policy in begun if (record := records.read(policy))]
         before = {name: sum(facts.get(name, 0.0) for facts in found) for name in ("steps", "hours")}
         return rows.assign(**{name: rows[name] + spent for name, spent in before.items()})
 
@@ -145,12 +147,15 @@ def _judge(
     seen = perception(work, trained, settings, world, noise=NOISE, device=session.device)
     depth = seen.depth.encoder if seen.depth else None
     conditions = _conditions(stage, policies)
+    judged = stage.folder / "kept.csv"
     # policies that are gone keep their rows; one that a run made again replaces the earlier one
     rows: dict[int, Mapping[str, Any]] = {
         int(row["iteration"]): row
-        for row in (along.read(stage.folder / "kept.csv") if session.resume else ())
+        for row in (along.read(judged) if session.resume and judged.exists() else ())
         if row["conditions"] == conditions
     }
+    # the record of fewer policies would call the file that grows now a damaged one
+    stage.record.unlink(missing_ok=True)
     for file in policies:
         name, iteration = digest(file)[:16], int(file.stem)
         if iteration in rows and rows[iteration]["policy"] == name:
@@ -162,7 +167,7 @@ def _judge(
         place = {"policy": name, "conditions": conditions, "iteration": iteration}
         place |= {"steps": saved["steps"], "hours": saved["hours"]}
         rows[iteration] = place | along.judge(driver, world, episodes, env, spec, progress, robots)
-        files.write(stage.folder / "kept.csv", files.csv_text([rows[i] for i in sorted(rows)], along.COLUMNS))
+        files.write(judged, files.csv_text([rows[i] for i in sorted(rows)], along.COLUMNS))
     return {"policies": len(policies)}
 
 

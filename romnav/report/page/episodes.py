@@ -17,7 +17,6 @@ from romnav.evaluation.episodes import EpisodeSet
 from romnav.evaluation.intervals import wilson
 from romnav.evaluation.paired.rows import HOW, WHERE
 from romnav.evaluation.tracks import RESOLUTION
-from romnav.navigation.spec import EnvSpec
 from romnav.report.paired.gallery import EpisodeGallery
 from romnav.report.paired.maps import shortest
 from romnav.world.grids import Grids
@@ -60,7 +59,7 @@ def content(galleries: Mapping[str, EpisodeGallery]) -> dict[str, Any]:
         ],
         "where": WHERE,
         "how": HOW,
-        "period": EnvSpec().period,
+        "periods": {name: gallery.period for name, gallery in galleries.items()},
         "tiles": {int(t): _maps(world.tiles[t], world.grids[t]) for t in np.unique(table.tile)},
         "ways": {
             **{name: _way(gallery) for name, gallery in galleries.items()},

@@ -32,6 +32,9 @@ const image = (source) => new Promise((done) => {
 });
 
 const player = { episode: 0, runs: [], hidden: new Set(), storeys: [], shortest: null, span: 1, time: 0, playing: false, asked: 0 };
+/** Time goes in steps of the shortest period, s; a run has a sample in every one of its own. */
+const period = Math.min(...Object.values(data.periods ?? {}));
+const sample = (run) => Math.min(Math.round((player.time * period) / data.periods[run.name]), run.way.x.length - 1);
 const nearest = (layers, z) => layers.reduce((best, layer, k) => (Math.abs(layer - z) < Math.abs(layers[best] - z) ? k : best), 0);
 
 async function openReplay(episode) {
@@ -51,7 +54,7 @@ async function openReplay(episode) {
   const side = Math.min(tile.side, Math.max(12, Math.max(...xs) - Math.min(...xs) + 5, Math.max(...ys) - Math.min(...ys) + 5));
   const corner = [xs, ys].map((v) => Math.min(Math.max((Math.min(...v) + Math.max(...v) - side) / 2, 0), tile.side - side));
   Object.assign(player, { episode, tile, runs, shortest: { way: shortest, layer: on(shortest) }, ends, side, corner, time: 0 });
-  player.span = Math.max(...runs.map((run) => run.way.x.length - 1), 1);
+  player.span = Math.max(...runs.map((run) => Math.ceil(((run.way.x.length - 1) * data.periods[run.name]) / period - 1e-6)), 1);
   player.storeys = layers.map((layer, k) => ({ layer, picture: pictures[k], canvas: make("canvas", { width: 640, height: 640, role: "img" }) }));
   replay.querySelector(".storeys").replaceChildren(...player.storeys.map(({ layer, canvas }) => make("figure", {}, make("figcaption", {}, tile.names[layer]), canvas)));
   replay.querySelector(".runs").replaceChildren(...runs.map((run) => make("label", {},
@@ -67,7 +70,7 @@ async function openReplay(episode) {
 function seek(time) {
   player.time = Math.min(time, player.span);
   document.getElementById("time").value = Math.round(player.time);
-  const seconds = (Math.round(player.time) * data.period).toFixed(1);
+  const seconds = (Math.round(player.time) * period).toFixed(1);
   document.getElementById("clock").textContent = `${seconds} s`;
   document.getElementById("time").setAttribute("aria-valuetext", `${seconds} s`);
   draw();
@@ -81,7 +84,7 @@ function play(on) {
 }
 function tick(now) {
   if (!player.playing || !replay.open) return;
-  seek(player.time + ((now - last) / 1000 / data.period) * document.getElementById("speed").value);
+  seek(player.time + ((now - last) / 1000 / period) * document.getElementById("speed").value);
   last = now;
   player.time < player.span ? requestAnimationFrame(tick) : play(false);
 }
@@ -120,7 +123,7 @@ function draw() {
     const here = [];
     for (const run of player.runs) {
       if (player.hidden.has(run.name)) continue;
-      const at = Math.min(Math.round(player.time), run.way.x.length - 1);
+      const at = sample(run);
       line(run.way, run.layer, at, tone(`--c${run.colour % 8}`), []);
       if (run.layer[at] !== layer) continue;
       here.push(run.name);
@@ -136,9 +139,9 @@ function draw() {
     canvas.setAttribute("aria-label", `Map of ${tile.names[layer]}; here: ${here.join(", ") || "no robot"}`);
   }
   for (const run of player.runs) {
-    const at = Math.min(Math.round(player.time), run.way.x.length - 1), result = data.results[run.name], k = player.episode;
+    const at = sample(run), result = data.results[run.name], k = player.episode;
     const end = at < run.way.x.length - 1 ? "" : result.success_time[k] === null ? ` (${result.where[k]}, ${result.how[k]})` : " (reached)";
-    replay.querySelector(`output[data-run="${CSS.escape(run.name)}"]`).textContent = `${(at * data.period).toFixed(0)} s, height ${run.way.z[at].toFixed(1)} m${end}`;
+    replay.querySelector(`output[data-run="${CSS.escape(run.name)}"]`).textContent = `${(at * data.periods[run.name]).toFixed(0)} s, height ${run.way.z[at].toFixed(1)} m${end}`;
   }
 }
 

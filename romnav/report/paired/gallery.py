@@ -51,13 +51,23 @@ class EpisodeTable:
 
 
 class EpisodeGallery(EpisodeTable):
-    """Rows and tracks of an arm on the terrain they are of, and a humanoid's postures if they were kept."""
+    """Rows and tracks of an arm on the terrain they are of, and a humanoid's postures if they were kept.
+
+    The samples of tracks and postures are ``period`` seconds apart, the arm's own.
+    """
 
     def __init__(
-        self, run: EpisodeRows, tracks: Tracks, episodes: EpisodeSet, world: World, postures: Postures | None = None
+        self,
+        run: EpisodeRows,
+        tracks: Tracks,
+        episodes: EpisodeSet,
+        world: World,
+        period: float,
+        postures: Postures | None = None,
     ) -> None:
         super().__init__(run)
         self.tracks, self.episodes, self.world, self.postures = tracks, episodes, world, postures
+        self.period = period
 
     def draw(self, chosen: Sequence[int], path: Path) -> None:
         """Draw maps of the chosen episodes and save them to ``path`` (type by its suffix)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from romnav.errors import RomnavError
 from romnav.report.formats import literal
+from romnav.report.lines import styles
 
-COLOURS = (
-    *("#1f4e79", "#c55a11", "#7f7f7f", "#2a9d78", "#b2182b"),
-    *("#7b5aa6", "#c99700", "#4bacc6", "#e377c2", "#111111"),
-)
 PANELS = (
     ("steps", "sr_120_same", "same level, 120 s"),
     ("steps", "sr_120_cross", "across levels, 120 s"),
@@ -42,19 +37,6 @@ def slope(runs: Sequence[pd.DataFrame], rate: str) -> float:
     return float(x @ y / (x @ x)) if x.any() else float("nan")
 
 
-def read(path: Path) -> pd.DataFrame:
-    """Rows of ``kept.csv``.
-
-    Raises:
-        RomnavError: The file is damaged.
-    """
-    try:
-        rows = pd.read_csv(path)
-        return rows.astype({name: float for name in rows.columns if name.startswith(("sr_", "steps"))})
-    except (OSError, ValueError) as error:
-        raise RomnavError(f"{path}: damaged ({error}); delete it and judge the kept policies again") from error
-
-
 def draw(arms: Mapping[str, Sequence[pd.DataFrame]], path: Path) -> None:
     """Draw success against steps and hours of every arm, a line for each seed, with its gain per doubling of the steps.
 
@@ -65,12 +47,12 @@ def draw(arms: Mapping[str, Sequence[pd.DataFrame]], path: Path) -> None:
     figure = Figure(figsize=(10.0, 3.2 + 0.16 * len(arms)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(PANELS)))
     for panel, (over, column, title) in zip(axes, PANELS, strict=True):
-        for colour, (label, runs) in zip(cycle(COLOURS), arms.items(), strict=False):
+        for (label, runs), (colour, dashes) in zip(arms.items(), styles(), strict=False):
             gain = slope(runs, column)
             told = label if np.isnan(gain) else f"{label} ({gain:+.1f} a doubling)"
             for run in runs:
                 x = run["steps"] / 1e6 if over == "steps" else run[over]
-                (line,) = panel.plot(x, run[column], color=colour, marker="o", markersize=3)
+                (line,) = panel.plot(x, run[column], color=colour, linestyle=dashes, marker="o", markersize=3)
             line.set_label(literal(told))
         panel.set_title(title, fontsize=9)
         _finish(panel, "million steps" if over == "steps" else "hours of training")

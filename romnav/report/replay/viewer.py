@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,6 @@ from scipy import stats
 
 from romnav.errors import RomnavError
 from romnav.evaluation.paired.replay import Replay
-from romnav.navigation.spec import EnvSpec
 from romnav.report.paired.gallery import EpisodeGallery
 from romnav.report.paired.maps import shortest
 from romnav.report.replay.parts import ARMS, COLOURS, Figure, parts
@@ -80,6 +80,8 @@ class Viewer:
         self._galleries, self._drive, self._robot = galleries, drive, robot
         first = next(iter(galleries.values()))
         self._episodes, self._world, self._table = first.episodes, first.world, first.table
+        # time goes in steps of the shortest period, s
+        self._period = min(gallery.period for gallery in galleries.values())
         self._seen: dict[tuple[str, int], Seen] = {}
         self._figure: Figure | None = None
         self._lock = threading.RLock()
@@ -186,8 +188,8 @@ class Viewer:
             self._points = scene.add_point_cloud("/points", np.zeros((1, 3)), (200, 30, 30), point_size=0.04)
             self._points.visible = False
             self._nodes.append(self._points)
-            longest = max(len(self._way(name)) for name in self._galleries)
-            self._time.max = longest - 1
+            ends = [(len(self._way(name)) - 1) * gallery.period for name, gallery in self._galleries.items()]
+            self._time.max = math.ceil(max(ends) / self._period - 1e-6)
             self._storeys.max = max(2, len(tile.storeys))
             self._storeys.value = self._storeys.max
             middle = route.mean(axis=0)
@@ -215,6 +217,10 @@ class Viewer:
     def _way(self, name: str) -> NDArray[np.float32]:
         tracks = self._galleries[name].tracks
         return tracks.position[tracks.of(self._episode)]
+
+    def _sample(self, name: str, step: int, count: int) -> int:
+        """Which of ``count`` samples of an arm, one a period of its own, is that of a step."""
+        return min(round(step * self._period / self._galleries[name].period), count - 1)
 
     def _cut(self) -> None:
         """Hide the storeys above those to show, and above the highest robot in sight."""
@@ -271,26 +277,25 @@ class Viewer:
             self._step = step
             for name, body in self._bodies.items():
                 way = self._way(name)
-                body.position = way[min(step, len(way) - 1)] + UP * HEIGHT / 2
+                body.position = way[self._sample(name, step, len(way))] + UP * HEIGHT / 2
                 body.visible = self._shown[name].value and name not in self._joints
             for name, meshes in self._joints.items():
                 joints = self._postures(name)
                 if joints is not None and self._figure:
-                    for mesh, at, turn in zip(
-                        meshes, *self._figure.place(joints[min(step, len(joints) - 1)]), strict=True
-                    ):
+                    posture = joints[self._sample(name, step, len(joints))]
+                    for mesh, at, turn in zip(meshes, *self._figure.place(posture), strict=True):
                         mesh.position, mesh.wxyz, mesh.visible = at, turn, self._shown[name].value
             self._cut()
             self._go_along()
-            seen = self._seen.get((self._eyes.value, self._episode))
+            eyes = self._eyes.value
+            seen = self._seen.get((eyes, self._episode))
             for shown in (self._range, self._classes, self._betas, self._along, self._points):
                 shown.visible = False
-            self._decided.content = (
-                "" if seen is None else self._draw_sight(seen, min(step, len(seen.replay.command) - 1))
-            )
+            self._decided.content = "" if seen is None else self._draw_sight(eyes, seen, step)
 
-    def _draw_sight(self, seen: Seen, step: int) -> str:
+    def _draw_sight(self, name: str, seen: Seen, step: int) -> str:
         replay, sight = seen.replay, seen.replay.sight
+        step = self._sample(name, step, len(replay.command))
         vx, vy, wz = replay.command[step]
         lines = [f"command {vx:+.2f} m/s ahead, {vy:+.2f} m/s to the left, {wz:+.2f} rad/s"]
         if replay.value is not None:
@@ -300,7 +305,7 @@ class Viewer:
         if replay.barrier is not None and replay.filtered is not None:
             x, y = replay.filtered[step]
             lines.append(f"filter: h = {replay.barrier[step]:.2f}, would let {x:+.2f}, {y:+.2f} m/s through")
-        self._plot(replay, step)
+        self._plot(replay, self._galleries[name].period * np.arange(step + 1))
         if sight is not None:
             self._points.points = sight.points(step)
             colours = matplotlib.colormaps["viridis_r"](np.clip(sight.ranges[step] / RANGE, 0, 1))[..., :3]
@@ -318,24 +323,23 @@ class Viewer:
             self._classes.visible = True
         return "\n\n".join(lines)
 
-    def _plot(self, replay: Replay, step: int) -> None:
-        """Expected return and h up to a step, as far as they are known."""
+    def _plot(self, replay: Replay, time: NDArray) -> None:
+        """Expected return and h at the samples so far, s, as far as they are known."""
         rows = (replay.value, replay.barrier)
         if all(row is None for row in rows):
             return
-        time = EnvSpec().period * np.arange(step + 1)
         blank = np.full(len(time), np.nan)
-        self._along.data = (time, *(blank if row is None else row[: step + 1].astype(float) for row in rows))
+        self._along.data = (time, *(blank if row is None else row[: len(time)].astype(float) for row in rows))
         self._along.visible = True
 
     def _play(self) -> None:
-        period, began, start = EnvSpec().period, time.monotonic(), 0
+        began, start = time.monotonic(), 0
         while self._running:
             time.sleep(FRAME)
             if not self._playing.value:
                 began, start = time.monotonic(), self._step
                 continue
-            step = start + int((time.monotonic() - began) / period * float(self._speed.value))
+            step = start + int((time.monotonic() - began) / self._period * float(self._speed.value))
             if step > self._time.max:
                 step, began, start = 0, time.monotonic(), 0
             if step != self._step:

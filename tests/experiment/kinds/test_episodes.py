@@ -8,7 +8,7 @@ import pytest
 
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session
-from romnav.experiment.kinds.episodes import episodes, ground, of_trained_arms
+from romnav.experiment.kinds.episodes import episodes, ground, look_at, of_trained_arms
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.workspace import Workspace
 from tests.experiment import conftest
@@ -31,6 +31,15 @@ def test_an_evaluation_tells_of_the_terrain_that_it_builds(work: Workspace) -> N
     stage.make(stage, Session(), lambda *report: told.append(report))
     assert told[:2] == [(1, 4, "tiles"), (2, 4, "tiles")]
     assert told[-1][0] == told[-1][1]
+
+
+def test_ways_are_looked_at_with_the_period_that_they_were_walked_with(work: Workspace) -> None:
+    period = "[navigation.env]\nperiod = 0.4\n"
+    scale = SCALE.replace("[evaluation]", f'{period}[evaluation]\nepisodes = "dev"')
+    here = conftest.workspace(work.project.root, scale)
+    stage = episodes(here, "straight", 0)
+    stage.make(stage, Session(), lambda *_: None)
+    assert look_at(here, "straight", 0).period == 0.4
 
 
 def test_policies_that_are_not_finished_are_left_out_in_one_line(work: Workspace) -> None:

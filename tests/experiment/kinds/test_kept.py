@@ -7,8 +7,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from romnav import files
 from romnav.errors import RomnavError
-from romnav.evaluation.paired.progress import read
+from romnav.evaluation.paired.progress import COLUMNS, read
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Session
 from romnav.experiment.kinds import kept as module
@@ -38,6 +39,7 @@ def test_each_policy_is_walked_once(work: Workspace, monkeypatch: pytest.MonkeyP
     folder = work.folder / "rom" / "seed-0"
     policy(folder / "kept" / "000002.pt", work, 1)
     first = kept(work, "rom", 0)
+    first.record.write_text('{"outputs": {"kept.csv": "that of fewer policies"}}')
     first.make(first, Session(), progress)
     once = len(walked)
     (row,) = read(folder / "kept.csv")
@@ -97,6 +99,16 @@ begin = "more"
 """
 
 
+def kept_rows(*places: tuple[float, float]) -> str:
+    """Text of ``kept.csv`` with a policy after each number of steps and hours."""
+    rows = [
+        dict.fromkeys(COLUMNS, 50.0)
+        | {"policy": "f00d", "conditions": "feed", "iteration": k, "steps": steps, "hours": hours}
+        for k, (steps, hours) in enumerate(places, 1)
+    ]
+    return files.csv_text(rows, COLUMNS)
+
+
 def test_what_a_run_begins_with_is_counted(work: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
     work.project.file("on").write_text(ON)
     monkeypatch.setattr(progress, "draw", lambda arms, path: drawn.update(arms))
@@ -104,12 +116,12 @@ def test_what_a_run_begins_with_is_counted(work: Workspace, monkeypatch: pytest.
     for arm, steps in (("rom", 500), ("more", 300), ("most", 100)):
         stage = policies.policy(work, arm, 0)
         record = records.begin(stage, True)
-        (stage.folder / "kept.csv").write_text(f"steps,hours,sr_120_all\n{steps / 2},0.5,60.0\n{steps},1.0,70.0\n")
+        (stage.folder / "kept.csv").write_text(kept_rows((steps / 2, 0.5), (steps, 1.0)))
         for name in stage.outputs:
             (stage.folder / name).write_text("made")
         records.finish(stage, record, None, {"steps": steps, "hours": 1.0}, 0.0)
     (work.folder / "rom" / "seed-3").mkdir()
-    (work.folder / "rom" / "seed-3" / "kept.csv").write_text("steps,hours,sr_120_all\n100,0.1,50.0\n")
+    (work.folder / "rom" / "seed-3" / "kept.csv").write_text(kept_rows((100, 0.1)))
     (figure,) = reports(work, "on", [0])
     figure.make(figure, Session(), lambda done, total, text: None)
     assert {label: [list(rows["steps"]) for rows in runs] for label, runs in drawn.items()} == {

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import io
 import itertools
 import zlib
@@ -66,3 +67,9 @@ def test_maps_show_the_grids_north_up(content: dict, galleries: dict[str, Episod
             occupied = (image == episodes.PALETTE["occupied"]).all(axis=2)
             expected = (grids.label[layer] >= 0) & ~grids.free[layer]
             np.testing.assert_array_equal(occupied, expected.T[::-1])
+
+
+def test_every_run_is_replayed_with_its_own_period(galleries: dict[str, EpisodeGallery]) -> None:
+    slow = copy.copy(galleries["straight"])
+    slow.period = 0.4
+    assert episodes.content(galleries | {"straight": slow})["periods"] == {"oracle": 0.2, "straight": 0.4}

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import copy
 import socket
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +99,47 @@ def test_another_episode_replaces_the_one_before(viewer: Viewer) -> None:
     assert f"{row.geodesic:.1f} m" in viewer._told.content
     assert viewer._time.max >= 1
     viewer._open(3)
+
+
+@pytest.fixture
+def slow(galleries: dict[str, EpisodeGallery]) -> Iterator[Viewer]:
+    """A viewer of arms that take steps of 0.4 and 0.8 s, the first of them looked through."""
+    made = {name: copy.copy(gallery) for name, gallery in galleries.items()}
+    made["oracle"].period, made["straight"].period = 0.4, 0.8
+    first, env = galleries["oracle"], EnvSpec(period=0.4)
+
+    def drive(name: str, episode: int) -> Seen:
+        again = replay(Oracle(), first.world, first.episodes, episode, env, EvaluationSpec())
+        return Seen(replace(again, value=np.arange(len(again.command), dtype=float)), None)
+
+    viewer = Viewer(made, [3], drive, RobotSpec(), port=free_port())
+    viewer._playing.value = False
+    yield viewer
+    viewer.stop()
+
+
+def test_arms_with_periods_of_their_own_are_shown_at_the_same_time(slow: Viewer) -> None:
+    ways = {name: slow._way(name) for name in ("oracle", "straight")}
+    assert slow._time.max == max(len(ways["oracle"]) - 1, 2 * (len(ways["straight"]) - 1))
+    for step in (0, 6, slow._time.max):
+        slow._show(step)
+        for name, sample in (("oracle", step), ("straight", step // 2)):
+            expected = ways[name][min(sample, len(ways[name]) - 1)] + [0, 0, HEIGHT / 2]
+            np.testing.assert_allclose(slow._bodies[name].position, expected, atol=1e-5)
+    slow._eyes.value = "oracle"
+    slow._look()
+    slow._show(6)
+    np.testing.assert_allclose(slow._along.data[0], 0.4 * np.arange(7))
+
+
+def test_a_replay_is_no_faster_than_its_speed(slow: Viewer) -> None:
+    began = time.monotonic()
+    slow._speed.value = "4"
+    slow._playing.value = True
+    time.sleep(1.0)
+    slow._playing.value = False
+    step, spent = slow._step, time.monotonic() - began
+    assert 0 < 0.4 * step <= 4 * spent
 
 
 def test_it_listens_on_the_loopback_alone_and_a_taken_port_is_one_line(
