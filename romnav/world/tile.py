@@ -62,7 +62,7 @@ class Tile:
 
     @property
     def multi_story(self) -> bool:
-        """Whether it has several floors. Outdoors these are layers a storey apart, which need not lie above one another."""
+        """Whether it has several floors; outdoors layers a storey apart, which need not lie above one another."""
         return len(self.storeys) > 1
 
 
