@@ -13,6 +13,7 @@ from romnav.experiment.kinds.locomotion import body, walking
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import suggest
 from romnav.experiment.workspace import Workspace
+from romnav.navigation.spec import require_same_task
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
     trained with the same seed.
 
     Raises:
-        RomnavError: One of these is no trained arm, the teacher was taught itself, or the arm begins with itself.
+        RomnavError: One of these is no trained arm, the teacher was taught itself or for another task, or the arm
+            begins with itself.
     """
     arm = work.project.driver(arm)
     settings = work.arm_settings(arm)
@@ -71,6 +73,8 @@ def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
     key = _trained(work, arm, "kickstart.teacher", teacher)
     if work.arm_settings(teacher).kickstart:
         raise RomnavError(f"{key}: {teacher} has a teacher itself; name one that was trained by PPO alone")
+    # known now, not after the teacher's training
+    require_same_task(work.arm_settings(teacher).navigation, work.arm_settings(arm).navigation, key)
     return policy(work, teacher, seed)
 
 

@@ -326,6 +326,27 @@ def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: 
         policy(here, "nav", 0)
 
 
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        ("navigation.env.command.forward = 0.3", r"navigation\.env\.command\.forward = 1, and its student has 0\.3"),
+        ("navigation.env.max_goal_distance = 20.0", r"navigation\.env\.max_goal_distance = 30, and its student has 20"),
+        ("navigation.env.period = 0.1", r"navigation\.env\.period = 0\.2, and its student has 0\.1"),
+        ("navigation.policy.support = 1.2", r"navigation\.policy\.support = 1, and its student has 1\.2"),
+    ],
+)
+def test_a_teacher_of_another_task_is_refused_before_it_is_trained(
+    tmp_path: Path, change: str, difference: str
+) -> None:
+    here = workspace(tmp_path)
+    taught = 'kickstart.teacher = "rom"'
+    here.project.file("kickstart").write_text((KICKSTART % "rom").replace(taught, f"{taught}\n{change}"))
+    with pytest.raises(
+        RomnavError, match=rf"kickstart\.toml: arms\.nav\.kickstart\.teacher: a teacher with {difference};"
+    ):
+        policy(here, "nav", 0)
+
+
 def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:
     here = workspace(tmp_path)
     here.project.file("kickstart").write_text(KICKSTART % "rom")
