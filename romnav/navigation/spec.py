@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from romnav.config import (
+    LARGEST,
     Config,
     Count,
     NonNegative,
@@ -102,8 +103,9 @@ class EnvSpec(Config):
     starting over)."""
     reach: Positive = 0.5
     """Distance that counts as arrival, m (P, of evaluation; A: in 3D, or goals would be reached from other floors)."""
-    max_goal_distance: Positive = 30.0
-    """d_max of the goal observation, m (A: the geodesic cap, beyond which no goal of training lies)."""
+    max_goal_distance: float = Field(default=30.0, gt=1.0, le=LARGEST)
+    """d_max of the goal observation, m, whose logarithm divides (A: the geodesic cap, beyond which no goal of training
+    lies)."""
     command: CommandSpec = CommandSpec()
     reward: RewardSpec = RewardSpec()
     sampler: SamplerSpec = SamplerSpec()

@@ -347,6 +347,18 @@ def test_a_teacher_of_another_task_is_refused_before_it_is_trained(
         policy(here, "nav", 0)
 
 
+def test_a_body_that_is_driven_by_another_arm_takes_that_arms_period(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    odd = (KICKSTART % "rom").replace("arms.rom", "arms.odd").replace('policy = "rom"', 'policy = "odd"')
+    odd = odd.replace('label = "RoM"', 'label = "Odd"\nnavigation.env.period = 0.19')
+    here.project.file("kickstart").write_text(odd)
+    assert episodes(here, "odd", 0)
+    with pytest.raises(
+        RomnavError, match=r"kickstart\.toml: arms\.nav-hum: navigation\.env\.period: 0\.19 s, no multiple"
+    ):
+        episodes(here, "nav-hum", 0)
+
+
 def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:
     here = workspace(tmp_path)
     here.project.file("kickstart").write_text(KICKSTART % "rom")
