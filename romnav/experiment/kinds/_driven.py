@@ -11,7 +11,7 @@ from romnav import __version__
 from romnav.evaluation.spec import EvaluationSpec, TrialSpec
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Stage
-from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.kinds.locomotion import body, cpu_only, walking
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import DRIVERS, SCRIPTED, parse
@@ -85,6 +85,11 @@ class Driven:
         above = (*self.policy.upstream, self.policy) if self.policy else ()
         present = {stage.name for stage in above}
         return (*(stage for stage in walking(self.work, self.settings) if stage.name not in present), *above)
+
+    @property
+    def cpu_only(self) -> bool:
+        """Whether its robots have physics on the CPU alone."""
+        return cpu_only(self.settings)
 
     @property
     def folder(self) -> Path:

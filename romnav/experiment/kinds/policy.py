@@ -9,7 +9,7 @@ from romnav import ranks
 from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.encoder import SENSORS, encoder, make_sensor
-from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.kinds.locomotion import body, cpu_only, walking
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import suggest
 from romnav.experiment.workspace import Workspace
@@ -63,6 +63,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         scratch=("checkpoint.pt",),
         beside=("curve.csv", "kept", "kept.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
+        cpu_only=cpu_only(settings),
         shared=True,
         arm=arm,
         seed=seed,

@@ -13,6 +13,9 @@ from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds import reports, trials
 from romnav.experiment.kinds.encoder import encoder, quality
 from romnav.experiment.kinds.episodes import episodes
+from romnav.experiment.kinds.generalization import generalization
+from romnav.experiment.kinds.kept import kept
+from romnav.experiment.kinds.locomotion import locomotion
 from romnav.experiment.kinds.navigation import navigation
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.project import Project
@@ -357,6 +360,23 @@ def test_a_body_that_is_driven_by_another_arm_takes_that_arms_period(tmp_path: P
         RomnavError, match=r"kickstart\.toml: arms\.nav-hum: navigation\.env\.period: 0\.19 s, no multiple"
     ):
         episodes(here, "nav-hum", 0)
+
+
+def test_whatever_walks_is_made_on_the_cpu_alone(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % "rom")
+    for arm, walks in {"rom": False, "nav": True, "nav-hum": True}.items():
+        stages = [episodes(here, arm, 0), trials.trials(here, "safety", arm, 0), generalization(here, arm, 0)]
+        if arm != "nav-hum":
+            kept_one = policy(here, arm, 0).folder / "kept" / "000001.pt"
+            kept_one.parent.mkdir(parents=True)
+            kept_one.touch()
+            stages += [policy(here, arm, 0), kept(here, arm, 0)]
+        assert [stage.cpu_only for stage in stages] == [walks] * len(stages), arm
+    assert policy(here, "nav-hum", 0) == policy(here, "rom", 0)
+    assert not encoder(here, "depth").cpu_only
+    assert navigation(here).cpu_only
+    assert locomotion(here).cpu_only
 
 
 def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:
