@@ -82,6 +82,12 @@ class Scale(Config):
                 f"navigation.env.period: {way:.2f} m in a step at the fastest (navigation.env.command.forward), "
                 f"beyond two cells of {cell} m (world.grid.cell): robots would jump over walls; lower it"
             )
+        robot = self.locomotion.robot
+        if self.navigation.dynamics == "g1" and not robot.ticks(env.period):
+            raise ValueError(
+                f"navigation.env.period: {env.period} s, no multiple of the humanoid's control step of "
+                f"{robot.timestep * robot.decimation} s (locomotion.robot.timestep * decimation); make it one"
+            )
         for name in ("evaluation", "safety", "deploy"):
             duration = getattr(self, name).duration
             if not 1.0 <= duration / env.period <= MOST_STEPS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import ValidationError
@@ -20,6 +21,23 @@ from romnav.tensors import Kind, require_finite
 KIND = Kind("romnav-policy-1", "policy", "train the arm by `romnav train policy`")
 """Policies, and the states of unfinished runs."""
 save, read = KIND.save, KIND.load
+
+
+def load_spec(path: Path) -> NavigationSpec:
+    """What the policy of ``path`` was trained with.
+
+    Raises:
+        RomnavError: As `read`; it is invalid.
+    """
+    return _spec(path, read(path))
+
+
+def _spec(path: Path, content: dict[str, Any]) -> NavigationSpec:
+    try:
+        return NavigationSpec.model_validate_json(content["spec"], context=parts.SAVED)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RomnavError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}; train the arm again") from error
 
 
 def load_critic(path: Path) -> PrivilegedCritic | None:
@@ -67,8 +85,8 @@ def load_actor(
             )
     if has_depth and depth_encoder is None:
         raise RomnavError(f"{path}: the policy sees through a depth camera; drive it on the humanoid that has one")
+    spec = _spec(path, content)
     try:
-        spec = NavigationSpec.model_validate_json(content["spec"], context=parts.SAVED)
         state = content["actor"]["state_embedding.0.weight"].shape[1] - BEARING
         seen = {"lidar": torch.zeros(1, *encoder.token_shape), "state": torch.zeros(1, state)}
         if has_depth and depth_encoder is not None:
@@ -77,9 +95,6 @@ def load_actor(
         if own:
             actor.encoder = copy.deepcopy(encoder)
         actor.load_state_dict(content["actor"])
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise RomnavError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}; train the arm again") from error
     except RuntimeError as error:
         reason = str(error).splitlines()[1].strip()
         raise RomnavError(f"{path}: a policy of another architecture ({reason}); train the arm again") from error

@@ -25,7 +25,7 @@ from romnav.navigation.observations import ACTIONS
 from romnav.navigation.perception import Perception
 from romnav.navigation.policy import NavigationActor
 from romnav.navigation.ppo import BoundedPPO
-from romnav.navigation.spec import KickstartSpec
+from romnav.navigation.spec import KickstartSpec, NavigationSpec, require_same_task
 
 PLACES = ("cross", "stairs")
 """Where divergences are reported apart: goals across levels; steps on a stair or ramp."""
@@ -69,19 +69,22 @@ def inherit(student: NavigationActor, teacher: NavigationActor) -> None:
 class Teacher:
     """A frozen policy that is asked what it would do, with a memory of its own."""
 
-    def __init__(self, path: Path, perception: Perception, spec: KickstartSpec, device: str) -> None:
-        """Load the policy of ``path``.
+    def __init__(
+        self, path: Path, perception: Perception, spec: KickstartSpec, student: NavigationSpec, device: str
+    ) -> None:
+        """Load the policy of ``path`` for a ``student``.
 
         Raises:
-            RomnavError: As `checkpoint.load_actor`; it has an encoder of its own, and cannot read the student's tokens.
+            RomnavError: As `checkpoint.load_actor` and `require_same_task`; it has an encoder of its own, and cannot
+                read the student's tokens.
         """
+        require_same_task(checkpoint.load_spec(path), student, str(path))
         depth = perception.depth.encoder if perception.depth else None
         with torch.random.fork_rng():  # the weights that a network is made with are drawn, and the run's draws go on
             self.actor = checkpoint.load_actor(path, perception.encoder, device, depth_encoder=depth)
         if self.actor.encoder is not None:
             raise RomnavError(f"{path}: a teacher that trained its encoder; kickstart from one with a frozen encoder")
         self.actor.requires_grad_(False)
-        self.path = path
         self.spec = spec
         self.digest = digest(path)
 
@@ -106,14 +109,8 @@ class KickstartedPPO(BoundedPPO):
             places: Gives the (E, 2) flags of `PLACES` of the present step.
 
         Raises:
-            RomnavError: Its Betas are over other actions than the student's; or as `inherit`.
+            RomnavError: As `inherit`.
         """
-        support, own = (actor.distribution.action_range[1] for actor in (teacher.actor, self.actor))
-        if support != own:
-            raise RomnavError(
-                f"{teacher.path}: a teacher with navigation.policy.support = {support:g}, and its student has {own:g}; "
-                "give both the same"
-            )
         self.teacher, self.places = teacher, places
         self._entropy: float = self.entropy_coef
         self._divergence = self.symmetry.by_name["divergence"] = Divergence(teacher.spec)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from romnav.config import (
+    LARGEST,
     Config,
     Count,
     NonNegative,
@@ -19,6 +21,7 @@ from romnav.config import (
     Threads,
     Width,
 )
+from romnav.errors import RomnavError
 from romnav.parts import Kind
 from romnav.sensing.spec import CorruptionSpec
 from romnav.world.spec import SamplerSpec
@@ -100,8 +103,9 @@ class EnvSpec(Config):
     starting over)."""
     reach: Positive = 0.5
     """Distance that counts as arrival, m (P, of evaluation; A: in 3D, or goals would be reached from other floors)."""
-    max_goal_distance: Positive = 30.0
-    """d_max of the goal observation, m (A: the geodesic cap, beyond which no goal of training lies)."""
+    max_goal_distance: float = Field(default=30.0, gt=1.0, le=LARGEST)
+    """d_max of the goal observation, m, whose logarithm divides (A: the geodesic cap, beyond which no goal of training
+    lies)."""
     command: CommandSpec = CommandSpec()
     reward: RewardSpec = RewardSpec()
     sampler: SamplerSpec = SamplerSpec()
@@ -286,3 +290,32 @@ class NavigationSpec(Config):
         if self.env.envs * self.ppo.steps < 2:
             raise ValueError("ppo.steps: one step of one environment has no deviation to normalise by; raise it")
         return self
+
+
+_TASK = (
+    "policy.support",
+    *(f"env.command.{limit}" for limit in CommandSpec.model_fields),
+    "env.max_goal_distance",
+    "env.period",
+)
+"""Settings that say what the numbers mean that a policy is given and gives."""
+
+
+def require_same_task(teacher: NavigationSpec, student: NavigationSpec, where: str) -> None:
+    """Checks that a teacher's actions mean what its student's do, and that both are told of the goal alike.
+
+    Args:
+        teacher: What it is trained with.
+        student: The same of the student.
+        where: What the error begins with: the file or the key that names the teacher.
+
+    Raises:
+        RomnavError: A setting differs that the divergence takes for the same.
+    """
+    for key in _TASK:
+        theirs, own = (attrgetter(key)(spec) for spec in (teacher, student))
+        if theirs != own:
+            raise RomnavError(
+                f"{where}: a teacher with navigation.{key} = {theirs:g}, and its student has {own:g}; "
+                "give both the same"
+            )

@@ -197,7 +197,7 @@ def _learner(
         return make_ppo(obs, spec.policy, spec.ppo, env.num_envs, device)
     if spec.encoder.unfreeze_at < 1.0:
         raise RomnavError("navigation.encoder.unfreeze_at: a teacher reads a frozen encoder's tokens; set it to 1.0")
-    teacher = Teacher(kickstart[1], perception, kickstart[0], device)
+    teacher = Teacher(kickstart[1], perception, kickstart[0], spec, device)
     ppo = make_ppo(blank_lesson(obs), spec.policy, spec.ppo, env.num_envs, device, KickstartedPPO)
     ppo.enrol(teacher, env.places)
     return ppo

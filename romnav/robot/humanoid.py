@@ -118,8 +118,8 @@ class Humanoid:
         self._first = torch.ones(envs, dtype=torch.bool)
         self.robots = Humanoids(self._spec.robot, [geoms(tile.solids) for tile in world.tiles], envs, threads=threads)
         self.control = Controller(self._spec, self.robots)
-        self._ticks = round(period / self.control.dt)
-        if abs(self._ticks * self.control.dt - period) > 1e-9:
+        self._ticks = self._spec.robot.ticks(period)
+        if not self._ticks:
             raise RomnavError(f"period {period} s: no multiple of the control step, {self.control.dt} s")
 
     def _enter_tiles(self) -> None:

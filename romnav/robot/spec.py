@@ -60,9 +60,16 @@ class RobotSpec(Config):
     kd_ratio: NonNegative = 0.07
     """Velocity gain over position gain, s (A)."""
     weld_arms: bool = True
-    """Fix the 14 arm joints at `elbow` (A: 15 instead of 29 joints halve the cost; navigation never uses the arms)."""
+    """Fix the 14 arm joints at `elbow` (A: 15 instead of 29 joints halve the cost; navigation never uses the arms).
+    False is for a model alone (`g1.build_spec`), to hold the fixed arms against: no robot here drives 29 joints."""
     elbow: float = Field(default=1.2, ge=-math.pi, le=math.pi)
     """Elbow angle of the fixed arms, rad (A)."""
+
+    def ticks(self, period: float) -> int:
+        """Control steps in a ``period``, s; 0 where it is no multiple of them."""
+        tick = self.timestep * self.decimation
+        count = round(period / tick)
+        return count if abs(count * tick - period) < 1e-9 else 0
 
 
 class GaitSpec(Config):
@@ -303,7 +310,9 @@ class LocomotionSpec(Config):
     """Of everything random."""
 
     @model_validator(mode="after")
-    def _has_steps(self) -> Self:
+    def _can_walk(self) -> Self:
+        if not self.robot.weld_arms:
+            raise ValueError("robot.weld_arms: false, but only legs and waist are driven; leave it out")
         tick = self.robot.timestep * self.robot.decimation
         for name, time in (
             ("task.episode", self.task.episode),

@@ -25,6 +25,8 @@ from tests.fuzz import FILE, leaves, nested
         ("navigation.env.period", 0.0),
         ("navigation.env.period", -0.2),
         ("navigation.env.period", 5.0),
+        ("navigation.env.max_goal_distance", 1.0),
+        ("navigation.env.max_goal_distance", 0.5),
         ("navigation.env.duration", 0.0),
         ("navigation.env.duration", math.nan),
         ("navigation.env.command.forward", -1.0),
@@ -62,6 +64,7 @@ from tests.fuzz import FILE, leaves, nested
         ("quality.images", 1),
         ("locomotion.iterations", 0),
         ("locomotion.robot.timestep", -0.01),
+        ("locomotion.robot.weld_arms", False),
         ("locomotion.task.shares", {"stairs": 1.0}),
         ("locomotion.task.shares", {"flat": 0.5, "cliff": 0.5}),
         ("locomotion.ppo.std", [1.0, 0.5, 0.2]),
@@ -81,6 +84,22 @@ def test_a_bad_setting_is_refused_by_its_key(key: str, value: Any) -> None:
     assert message.startswith("mine.toml: ")
     assert key in message.replace(": ", ".", 2) or key in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("period", [0.19, 0.2, 0.21, 0.3, 0.01])
+def test_a_humanoid_is_commanded_at_its_control_steps(period: float) -> None:
+    """Known before a teacher is trained; other bodies take any period."""
+    commanded = {"navigation": {"env": {"period": period}}}
+    parse(Scale, commanded, FILE)
+    walking = {"navigation": {**commanded["navigation"], "dynamics": "g1"}}
+    if period in (0.2, 0.3):
+        parse(Scale, walking, FILE)
+        return
+    with pytest.raises(
+        RomnavError, match=rf"^mine\.toml: navigation\.env\.period: {period} s, no multiple of .*0\.02 s"
+    ):
+        parse(Scale, walking, FILE)
+    parse(Scale, {**walking, "locomotion": {"robot": {"decimation": 1}}}, FILE)  # of 10 ms
 
 
 SETTINGS = dict(leaves(Scale()))

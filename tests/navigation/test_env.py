@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from math import exp, hypot
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -132,3 +134,100 @@ def test_environments_of_another_process_are_those_of_one(world: World, percepti
     for whole, share in zip(drive(range(12)), drive(range(6, 12)), strict=True):
         for name, seen in share.items():
             assert torch.equal(seen, whole[name][6:]), name
+
+
+class Puppet(ReducedOrderModel):
+    """A body that goes where it is told to go next, whatever it is commanded."""
+
+    def step(self, command: torch.Tensor) -> None:
+        self.position, self.yaw = self.next_position.clone(), self.next_yaw.clone()
+        self.contacts, self.fallen = self.next_contacts.clone(), self.next_fallen.clone()
+
+
+def test_a_step_pays_what_the_papers_table_says(world: World, perception: object) -> None:
+    """Four robots, all at (x, 0), whose way to the goal is as long as x: one beside its goal that turns to it, one that
+    climbs, backs off and touches two bodies, one that stands on its goal but for the last decimetres, one that runs,
+    and falls in the second step."""
+    spec = EnvSpec(envs=4)
+    body = Puppet(world, 4, spec.period)
+    env = NavigationEnv(world, body, perception, spec, 3, "cpu")
+    env._lookup = lambda tile, layer, xy, goal: (xy[:, 0].clone(), torch.ones(len(xy), 2))
+    env._goal_position = torch.tensor([[1.0, 0.3, 2.0], [1.0, 0.0, 5.0], [0.0, 0.0, 2.0], [9.0, 3.0, 2.0]])
+    env._goal_yaw = torch.tensor([3.0, 0.0, 0.0, 0.0])
+    env._best = torch.tensor([[1.5, 0.25], [5.0, 3.0], [0.1, 0.25], [8.0, 0.0]])
+    env._command = torch.tensor([[0.5, 0.1, -0.2], [0.25, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    env.episode_length_buf = torch.zeros(4, dtype=torch.long)
+    body.next_position = torch.tensor([[1.44, 0.0, 1.75], [5.3, 0.0, 2.02], [0.06, 0.0, 1.75], [7.0, 0.0, 2.0]])
+    body.next_yaw = torch.tensor([-3.0, 0.0, 0.4, 3.0])
+    body.next_contacts = torch.tensor([0.0, 2.0, 0.0, 1.0])
+    body.next_fallen = torch.zeros(4, dtype=torch.bool)
+    # forward is 0.25 + 0.75 of the first action, m/s; sideways a quarter of the second; the turn is the third
+    chosen = torch.tensor([[-0.2, 0.0, 0.0], [1.0, 1.0, -0.5], [-1 / 3, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    around = 2 * 3.141592653589793 - 6.0  # from -3 to 3 rad the short way round
+    first = [
+        {
+            "position": 1 + exp(-((hypot(0.44, 0.3) / 0.5) ** 2)) + exp(-((hypot(0.44, 0.3) / 0.1) ** 2)),
+            "heading": exp(-((around / 0.5) ** 2)),
+            "height": exp(-((0.25 / 2.5) ** 2)) + exp(-((0.25 / 0.5) ** 2)),
+            "stand": exp(-((0.1 / 0.1) ** 2)),
+            "geodesic_progress": 0.06 / 0.15,  # of 0.75 m/s in 0.2 s
+            "height_progress": 0.0,
+            "collision": 0.0,
+            "action_rate": 0.4**2 + 0.1**2 + 0.2**2,
+        },
+        {
+            "position": 0.0,  # 5.3 m away by foot, beyond the gate of 2 m
+            "heading": 0.0,
+            "height": exp(-((2.98 / 2.5) ** 2)) + exp(-((2.98 / 0.5) ** 2)),
+            "stand": 0.0,
+            "geodesic_progress": 0.0,
+            "height_progress": 0.02 / 0.05,  # of 0.25 m/s in 0.2 s
+            "collision": 2.0,
+            "action_rate": 0.75**2 + 0.25**2 + 0.5**2,
+        },
+        {
+            "position": 1 + exp(-((0.06 / 0.5) ** 2)) + exp(-((0.06 / 0.1) ** 2)),
+            "heading": exp(-((0.4 / 0.5) ** 2)),
+            "height": exp(-((0.25 / 2.5) ** 2)) + exp(-((0.25 / 0.5) ** 2)),
+            "stand": 1.0,
+            "geodesic_progress": 0.04 / 0.08,  # of 80% of the 0.1 m that were left
+            "height_progress": 0.0,
+            "collision": 0.0,
+            "action_rate": 0.0,
+        },
+        {
+            "position": 0.0,
+            "heading": 0.0,
+            "height": 2.0,
+            "stand": 0.0,
+            "geodesic_progress": 1.0,  # 1 m, more than full
+            "height_progress": 0.0,
+            "collision": 1.0,
+            "action_rate": 1.0,
+        },
+    ]
+    # whoever stays where it was under the same command makes no progress and changes no command
+    second = [{**robot, "geodesic_progress": 0.0, "height_progress": 0.0, "action_rate": 0.0} for robot in first]
+    weights = {"position": 0.2, "heading": 0.2, "height": 0.2, "stand": 0.2}
+    weights |= {"geodesic_progress": 0.1, "height_progress": 0.1, "collision": -1.0, "action_rate": -0.01}
+    period = 0.2  # returns are integrals over time
+
+    def paid(values: list[dict[str, float]]) -> list[float]:
+        return [period * sum(weights[name] * value for name, value in robot.items()) for robot in values]
+
+    env.statistics()
+    reward, fallen, time_outs = env.advance(chosen)
+    assert reward.tolist() == pytest.approx(paid(first), rel=1e-4)
+    assert not fallen.any()
+    assert not time_outs.any()
+
+    body.next_fallen[3] = True
+    env.episode_length_buf[[0, 3]] = env.max_episode_length - 1
+    _, reward, done, extras = env.step(chosen)
+    assert reward.tolist() == pytest.approx(paid(second), rel=1e-4)
+    assert done.tolist() == [True, False, False, True]
+    # a fall ends the episode, even in its last step: nothing is bootstrapped
+    assert extras["time_outs"].tolist() == [True, False, False, False]
+
+    means = {name: period * weights[name] * sum(robot[name] for robot in first + second) / 8 for name in weights}
+    assert env.statistics().reward == pytest.approx(means, rel=1e-4)

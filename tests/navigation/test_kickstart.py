@@ -121,7 +121,7 @@ def rollout(world: World, path: Path, spec: KickstartSpec = SPEC, steps: int = 3
     ppo_spec = SMALL.ppo.model_copy(update={"steps": steps})
     obs = env.get_observations()
     ppo = make_ppo(blank_lesson(obs), SMALL.policy, ppo_spec, 12, "cpu", KickstartedPPO)
-    own = Teacher(path, perception, spec, "cpu")
+    own = Teacher(path, perception, spec, SMALL, "cpu")
     ppo.enrol(own, env.places)
     ppo.begin(0.0)
     with torch.inference_mode():
@@ -188,7 +188,7 @@ def test_a_student_with_the_teachers_weights_acts_like_it_until_it_has_learned(
     perception = WithCamera()
     rest = torch.rand(6, 3), torch.rand(6), torch.rand(6, 3), torch.zeros(6, 2), perception, 30.0
     obs = observe(Feeling(world, 6, 0.2), *rest)
-    own = Teacher(teacher, perception, SPEC, "cpu").actor
+    own = Teacher(teacher, perception, SPEC, spec, "cpu").actor
     student = make_actor(obs, spec.policy)
     assert not torch.allclose(student(obs), own(obs), atol=1e-3)
     inherit(student, own)
@@ -256,6 +256,26 @@ def test_teachers_that_do_not_fit_are_refused(
     wider = spec.model_copy(update={"policy": spec.policy.model_copy(update={"support": 1.2})})
     with pytest.raises(RomnavError, match=r"policy\.support = 1, and its student has 1\.2"):
         train.train(wider, world, FakePerception(), tmp_path / "d", 1, kickstart=(SPEC, teacher))
+
+
+@pytest.mark.parametrize(
+    ("key", "own", "difference"),
+    [
+        ("command", {"forward": 0.3}, r"command\.forward = 1, and its student has 0\.3"),
+        ("command", {"reverse": 0.3}, r"command\.reverse = 0\.5, and its student has 0\.3"),
+        ("command", {"lateral": 0.3}, r"command\.lateral = 0\.25, and its student has 0\.3"),
+        ("command", {"turn": 0.3}, r"command\.turn = 1, and its student has 0\.3"),
+        ("max_goal_distance", 20.0, r"max_goal_distance = 30, and its student has 20"),
+        ("period", 0.1, r"period = 0\.2, and its student has 0\.1"),
+    ],
+)
+def test_a_teacher_of_another_task_is_refused(
+    world: World, spec: NavigationSpec, teacher: Path, tmp_path: Path, key: str, own: object, difference: str
+) -> None:
+    """The divergence would take the same numbers for the same velocities."""
+    other = NavigationSpec.model_validate({**spec.model_dump(), "env": {**spec.env.model_dump(), key: own}})
+    with pytest.raises(RomnavError, match=rf"{teacher}: a teacher with navigation\.env\.{difference}; give both"):
+        train.train(other, world, FakePerception(), tmp_path, 1, kickstart=(SPEC, teacher))
 
 
 def test_places_of_the_robots(world: World, spec: NavigationSpec) -> None:

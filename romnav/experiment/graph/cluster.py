@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from romnav.errors import RomnavError
-from romnav.experiment.graph.run import execute, start_over
+from romnav.experiment.graph.run import execute, require_device, start_over
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.progress import lines
 
@@ -49,17 +49,18 @@ def execute_on_ray(
 
     Raises:
         RomnavError: Another engine; Ray is not installed or cannot be reached; a stage cannot do or write what it
-            should.
+            should, or cannot be made on the device.
     """
     if address != "ray" and not address.startswith("ray://"):
         raise RomnavError(f"--on {address}: no engine; give ray or ray://host:port")
+    stages = list(stages)
+    require_device(stages, session)
     try:
         import ray
         from ray.util.queue import Queue as RayQueue
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
     except ImportError as error:
         raise RomnavError("--on ray: Ray is not installed; run `pip install 'romnav[ray]'`") from error
-    stages = list(stages)
     if not session.resume:
         start_over(stages, say)
         session = replace(session, resume=True)  # a stage that goes on elsewhere must not start over

@@ -107,6 +107,20 @@ def prepare(stages: Iterable[Stage]) -> None:
             files.prepare(path)
 
 
+def require_device(stages: Iterable[Stage], session: Session) -> None:
+    """Checks that all stages can be made on the device, which is better known before the first one than hours later.
+
+    Raises:
+        RomnavError: Some can be made on the CPU alone, and are to be made elsewhere.
+    """
+    bound = list(dict.fromkeys(stage.arm or stage.name for stage in stages if stage.cpu_only))
+    if bound and session.device != "cpu":
+        raise RomnavError(
+            f"--device {session.device}: {', '.join(bound)}: made on the CPU alone, where their physics runs; first "
+            f"`romnav train policy ARM --device {session.device}` for each other arm, then these with --device cpu"
+        )
+
+
 def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None] = lambda line: None) -> None:
     """Runs stages one after the other; what is finished stays finished when a later one fails.
 
@@ -116,8 +130,10 @@ def execute(stages: Iterable[Stage], session: Session, say: Callable[[str], None
         say: Is told which stage begins, and which of its settings have changed since it last ran.
 
     Raises:
-        RomnavError: A stage cannot do or write what it should.
+        RomnavError: A stage cannot do or write what it should, or cannot be made on the device.
     """
+    stages = list(stages)
+    require_device(stages, session)
     # looked up now: another commit may be checked out before a long stage ends
     if records.provenance()["commit"] == records.UNKNOWN:
         say(f"{records.ROOT}: git does not tell the commit, recorded as unknown; see what `git status` says there")

@@ -80,6 +80,8 @@ class Stage:
     """Words after ``romnav`` that make it alone, if there is such a command."""
     on_request: bool = False
     """Whether it is made only where it is asked for itself: nobody should begin it by accident."""
+    cpu_only: bool = False
+    """Whether it can be made on the CPU alone."""
     shared: bool = False
     """Whether several processes can make it together (`romnav.ranks`)."""
     arm: str | None = None

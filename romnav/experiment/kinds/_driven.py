@@ -11,10 +11,10 @@ from romnav import __version__
 from romnav.evaluation.spec import EvaluationSpec, TrialSpec
 from romnav.experiment.graph import records
 from romnav.experiment.graph.stage import Stage
-from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.kinds.locomotion import body, cpu_only, walking
 from romnav.experiment.kinds.policy import perception, policy
 from romnav.experiment.scales import Scale
-from romnav.experiment.spec import DRIVERS, SCRIPTED
+from romnav.experiment.spec import DRIVERS, SCRIPTED, parse
 from romnav.experiment.workspace import Workspace
 from romnav.files import digest
 
@@ -46,12 +46,19 @@ class Driven:
 
     @classmethod
     def by(cls, work: Workspace, arm: str, seed: int) -> Driven:
-        """The arm as it drives: its own policy or script, or another arm's on a body of its own."""
+        """The arm as it drives: its own policy or script, or another arm's on a body of its own.
+
+        Raises:
+            RomnavError: No experiment has this arm, or it cannot be trained or driven with these settings.
+        """
         driver, script = work.project.driver(arm), work.project.script(arm)
         trained = None if script else policy(work, arm, seed)
         settings = work.arm_settings(driver) if trained else work.settings
         if arm not in SCRIPTED and (script or driver != arm):
-            settings = settings.on_body(work.arm_settings(arm).navigation)
+            other = settings.on_body(work.arm_settings(arm).navigation)
+            # together with the driver's settings: its period, too, has to be one of this body
+            file = work.project.file(work.project.having(arm)[0])
+            settings = parse(Scale, other.model_dump(mode="json"), file, f"arms.{arm}.")
         return cls(work, arm, seed if trained else 0, trained, settings, work.project.filtered(arm))
 
     @property
@@ -78,6 +85,11 @@ class Driven:
         above = (*self.policy.upstream, self.policy) if self.policy else ()
         present = {stage.name for stage in above}
         return (*(stage for stage in walking(self.work, self.settings) if stage.name not in present), *above)
+
+    @property
+    def cpu_only(self) -> bool:
+        """Whether its robots have physics on the CPU alone."""
+        return cpu_only(self.settings)
 
     @property
     def folder(self) -> Path:

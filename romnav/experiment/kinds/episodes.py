@@ -48,6 +48,7 @@ def episodes(work: Workspace, arm: str, seed: int, *, joints: bool = False) -> S
         reads=(paired_set(work),),
         code=(f"rows {ROWS_VERSION}", *driven.code),
         upstream=driven.upstream,
+        cpu_only=driven.cpu_only,
         command=work.command("eval", arm, "--seed", str(driven.seed)),
         arm=arm,
         seed=driven.seed,

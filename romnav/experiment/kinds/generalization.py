@@ -40,6 +40,7 @@ def generalization(work: Workspace, arm: str, seed: int) -> Stage:
         reads=(work.project.root / "experiments" / "episodes" / f"{EPISODES}.json",),
         code=driven.code,
         upstream=driven.upstream,
+        cpu_only=driven.cpu_only,
         command=work.command("eval", arm, "--generalization", "--seed", str(seed)),
         arm=arm,
         seed=seed,

@@ -52,6 +52,7 @@ def kept(work: Workspace, arm: str, seed: int) -> Stage:
         make=partial(_judge, work, trained, policies),
         reads=(work.project.root / "experiments" / "episodes" / f"{EPISODES}.json", *policies),
         upstream=tuple(above for above in trained.upstream if above.kind != "policy"),
+        cpu_only=trained.cpu_only,
         command=work.command("eval", str(trained.arm), "--kept", "--seed", str(seed)),
         arm=trained.arm,
         seed=seed,

@@ -35,6 +35,7 @@ def locomotion(work: Workspace) -> Stage:
         make=partial(_train, work),
         command=work.command("train", "locomotion"),
         on_request=True,  # it takes hours
+        cpu_only=True,
     )
 
 
@@ -101,6 +102,11 @@ def _of_the_policy(
 def walking(work: Workspace, settings: Scale) -> tuple[Stage, ...]:
     """What robots of these settings need to walk."""
     return (locomotion(work), gaits(work)) if settings.navigation.dynamics == "g1" else ()
+
+
+def cpu_only(settings: Scale) -> bool:
+    """Whether robots of these settings have physics on the CPU alone."""
+    return settings.navigation.dynamics == "g1"
 
 
 def body(work: Workspace, settings: Scale, seed: int, device: str, threads: int) -> Body:

@@ -33,6 +33,7 @@ def navigation(work: Workspace) -> Stage:
         make=partial(_count, drivers),
         reads=(_episodes(work),),
         upstream=rom.upstream,
+        cpu_only=rom.cpu_only,
     )
 
 

@@ -9,10 +9,11 @@ from romnav import ranks
 from romnav.errors import RomnavError
 from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds.encoder import SENSORS, encoder, make_sensor
-from romnav.experiment.kinds.locomotion import body, walking
+from romnav.experiment.kinds.locomotion import body, cpu_only, walking
 from romnav.experiment.scales import Scale
 from romnav.experiment.spec import suggest
 from romnav.experiment.workspace import Workspace
+from romnav.navigation.spec import require_same_task
 from romnav.progress import Progress
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
     trained with the same seed.
 
     Raises:
-        RomnavError: One of these is no trained arm, the teacher was taught itself, or the arm begins with itself.
+        RomnavError: One of these is no trained arm, the teacher was taught itself or for another task, or the arm
+            begins with itself.
     """
     arm = work.project.driver(arm)
     settings = work.arm_settings(arm)
@@ -61,6 +63,7 @@ def policy(work: Workspace, arm: str, seed: int) -> Stage:
         scratch=("checkpoint.pt",),
         beside=("curve.csv", "kept", "kept.csv"),
         command=work.command("train", "policy", arm, "--seed", str(seed)),
+        cpu_only=cpu_only(settings),
         shared=True,
         arm=arm,
         seed=seed,
@@ -71,6 +74,8 @@ def _teacher(work: Workspace, arm: str, teacher: str, seed: int) -> Stage:
     key = _trained(work, arm, "kickstart.teacher", teacher)
     if work.arm_settings(teacher).kickstart:
         raise RomnavError(f"{key}: {teacher} has a teacher itself; name one that was trained by PPO alone")
+    # known now, not after the teacher's training
+    require_same_task(work.arm_settings(teacher).navigation, work.arm_settings(arm).navigation, key)
     return policy(work, teacher, seed)
 
 

@@ -62,6 +62,7 @@ def trials(work: Workspace, kind: TrialKind, arm: str, seed: int) -> Stage:
         reads=SCENES,
         code=driven.code,
         upstream=driven.upstream,
+        cpu_only=driven.cpu_only,
         arm=arm,
         seed=driven.seed,
     )

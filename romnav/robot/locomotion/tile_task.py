@@ -126,7 +126,12 @@ class TileEnv(WalkingEnv):
         self.command = torch.where(due[:, None], torch.where(on_path[:, None], path, drawn), self.command)
 
     def _along_path(self, stray: Tensor) -> Tensor:
-        """Commands (n, 3) along the shortest paths, as the scripted oracle of the evaluation gives them."""
+        """Commands (n, 3) along the shortest paths turned by `stray` (n,), rad.
+
+        The rule is that of the evaluation's scripted oracle (`evaluation.scripted.walk`), with its gain of the turn and
+        its angle beyond which robots turn on the spot, but each robot has a speed of its own, and none slows before its
+        goal.
+        """
         limits = self.spec.task
         xy = self.robots.pelvis[:, :2]
         _, along = self._lookup(self.tile, self.layer, xy, self.goal)

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from romnav.config import Config
 from romnav.errors import RomnavError
 from romnav.experiment.graph import records
+from romnav.experiment.graph.cluster import execute_on_ray
 from romnav.experiment.graph.run import execute, pending, prepare, require, start_over, waves, with_all_above
 from romnav.experiment.graph.stage import Session, Stage
 
@@ -395,6 +396,29 @@ def test_a_record_stays_as_it_is_when_the_same_comes_out(chain: list[Stage]) -> 
 def test_a_device_that_is_not_there_is_one_clear_error() -> None:
     with pytest.raises(RomnavError, match=r"device cdua: .*; use cpu, cuda or cuda:N"):
         Session("cdua")
+
+
+def test_what_is_made_on_the_cpu_alone_is_refused_elsewhere_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Session, "__post_init__", lambda session: None)  # there is no such device here
+    first = stage(tmp_path, "a", Settings())
+    arms = [
+        stage(tmp_path, key, Settings(), (first,), arm=arm, cpu_only=True)
+        for key, arm in zip("bcd", ("x", "x", None), strict=True)
+    ]
+    cuda, message = (
+        Session("cuda:1"),
+        r"^--device cuda:1: x, d: made on the CPU alone, .* then these with --device cpu$",
+    )
+    with pytest.raises(RomnavError, match=message):
+        execute(iter([first, *arms]), cuda)
+    with pytest.raises(RomnavError, match=message):
+        execute_on_ray("ray", {}, iter([first, *arms]), cuda, print)
+    assert not first.record.exists()
+    execute([first], cuda)
+    execute(iter(arms), Session())
+    assert all(made.record.exists() for made in (first, *arms))
 
 
 def test_a_report_that_was_drawn_without_an_arm_is_not_finished(tmp_path: Path) -> None:

@@ -13,6 +13,9 @@ from romnav.experiment.graph.stage import Session, Stage
 from romnav.experiment.kinds import reports, trials
 from romnav.experiment.kinds.encoder import encoder, quality
 from romnav.experiment.kinds.episodes import episodes
+from romnav.experiment.kinds.generalization import generalization
+from romnav.experiment.kinds.kept import kept
+from romnav.experiment.kinds.locomotion import locomotion
 from romnav.experiment.kinds.navigation import navigation
 from romnav.experiment.kinds.policy import policy
 from romnav.experiment.project import Project
@@ -324,6 +327,56 @@ def test_only_arms_trained_alone_can_teach(tmp_path: Path, teacher: str, match: 
     here.project.file("kickstart").write_text(KICKSTART % teacher)
     with pytest.raises(RomnavError, match=f"arms.nav.kickstart.teacher: .*{match}"):
         policy(here, "nav", 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        ("navigation.env.command.forward = 0.3", r"navigation\.env\.command\.forward = 1, and its student has 0\.3"),
+        ("navigation.env.max_goal_distance = 20.0", r"navigation\.env\.max_goal_distance = 30, and its student has 20"),
+        ("navigation.env.period = 0.1", r"navigation\.env\.period = 0\.2, and its student has 0\.1"),
+        ("navigation.policy.support = 1.2", r"navigation\.policy\.support = 1, and its student has 1\.2"),
+    ],
+)
+def test_a_teacher_of_another_task_is_refused_before_it_is_trained(
+    tmp_path: Path, change: str, difference: str
+) -> None:
+    here = workspace(tmp_path)
+    taught = 'kickstart.teacher = "rom"'
+    here.project.file("kickstart").write_text((KICKSTART % "rom").replace(taught, f"{taught}\n{change}"))
+    with pytest.raises(
+        RomnavError, match=rf"kickstart\.toml: arms\.nav\.kickstart\.teacher: a teacher with {difference};"
+    ):
+        policy(here, "nav", 0)
+
+
+def test_a_body_that_is_driven_by_another_arm_takes_that_arms_period(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    odd = (KICKSTART % "rom").replace("arms.rom", "arms.odd").replace('policy = "rom"', 'policy = "odd"')
+    odd = odd.replace('label = "RoM"', 'label = "Odd"\nnavigation.env.period = 0.19')
+    here.project.file("kickstart").write_text(odd)
+    assert episodes(here, "odd", 0)
+    with pytest.raises(
+        RomnavError, match=r"kickstart\.toml: arms\.nav-hum: navigation\.env\.period: 0\.19 s, no multiple"
+    ):
+        episodes(here, "nav-hum", 0)
+
+
+def test_whatever_walks_is_made_on_the_cpu_alone(tmp_path: Path) -> None:
+    here = workspace(tmp_path)
+    here.project.file("kickstart").write_text(KICKSTART % "rom")
+    for arm, walks in {"rom": False, "nav": True, "nav-hum": True}.items():
+        stages = [episodes(here, arm, 0), trials.trials(here, "safety", arm, 0), generalization(here, arm, 0)]
+        if arm != "nav-hum":
+            kept_one = policy(here, arm, 0).folder / "kept" / "000001.pt"
+            kept_one.parent.mkdir(parents=True)
+            kept_one.touch()
+            stages += [policy(here, arm, 0), kept(here, arm, 0)]
+        assert [stage.cpu_only for stage in stages] == [walks] * len(stages), arm
+    assert policy(here, "nav-hum", 0) == policy(here, "rom", 0)
+    assert not encoder(here, "depth").cpu_only
+    assert navigation(here).cpu_only
+    assert locomotion(here).cpu_only
 
 
 def test_trials_are_on_the_body_that_the_arm_walks_on(tmp_path: Path) -> None:

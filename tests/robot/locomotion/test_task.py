@@ -6,6 +6,7 @@ import csv
 import math
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from romnav.robot.locomotion.lane_task import LocomotionEnv
 from romnav.robot.locomotion.legs import rotation
 from romnav.robot.locomotion.mirror import ACTION_MIRROR, MIRROR, PRIVILEGED_MIRROR
 from romnav.robot.locomotion.planar import turn_xy
+from romnav.robot.locomotion.task import tracking_error
 from romnav.robot.locomotion.terrain import curriculum, flat, stairs
 from romnav.robot.locomotion.tile_task import TileEnv
 from romnav.robot.locomotion.train import KIND, load_policy, train
@@ -71,6 +73,91 @@ def test_a_torso_that_leans_costs_whichever_way() -> None:
     for turn in (rotation(1, torch.tensor(0.3)), rotation(0, torch.tensor(-0.3))):
         env.robots.torso_rotation = turn.expand(8, 3, 3)
         assert env.rewards()["torso"].numpy() == pytest.approx(-2.0 * math.sin(0.3) ** 2)
+
+
+def test_tracking_errors_are_the_state_less_the_reference() -> None:
+    """Two robots that face along y: one on its left foot, one, tipped forward and turned on, on its right."""
+    quarter = math.pi / 2
+    facing = rotation(2, torch.tensor(quarter))
+    tipped = rotation(2, torch.tensor(quarter + 0.2)) @ rotation(1, torch.tensor(0.3))
+    toe_down, level = rotation(1, torch.tensor(0.1)), torch.eye(3)
+    robots = SimpleNamespace(
+        count=2,
+        com=torch.tensor([[1.0, 2.5, 0.7], [0.0, 0.0, 0.7]]),
+        com_velocity=torch.tensor([[0.1, 0.6, 0.0], [-0.2, 0.4, 0.0]]),
+        orientation=torch.stack([facing, tipped]),
+        pelvis=torch.tensor([[9.0, 9.0, 0.75], [9.0, 9.0, 0.70]]),
+        velocity=torch.tensor([[9.0, 9.0, 0.05], [9.0, 9.0, -0.1]]),
+        spin=torch.tensor([[0.1, 0.2, 0.5], [0.0, 0.0, -0.3]]),
+        ankle_rotation=torch.stack([torch.stack([level, toe_down]), torch.stack([level, toe_down])]),
+    )
+    reference = SimpleNamespace(
+        side=torch.tensor([1.0, -1.0]),
+        com=torch.tensor([[0.3, 0.1], [0.0, 0.0]]),
+        com_velocity=torch.tensor([[0.5, 0.0], [0.0, 0.0]]),
+        height=torch.tensor([0.73, 0.73]),
+        heading=torch.tensor([quarter, quarter]),
+        swing=torch.tensor([[1.2, 2.4, 0.10], [0.2, -0.1, 0.05]]),
+        sole=torch.tensor(
+            [[[0.8, 2.1, 0.0], [1.25, 2.35, 0.13]], [[0.3, -0.3, 0.04], [-0.1, 0.2, 0.0]]],
+        ),
+    )
+    foot_rate = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    error, rate = tracking_error(robots, reference, foot_rate, torch.tensor([0.02, 0.0]), torch.tensor([0.4, 0.0]))
+    expected = torch.tensor(
+        [
+            # 0.4 m ahead of the left sole, 0.2 m right of it; 2 cm too high; upright; the right sole off by 5, -5, 3 cm
+            [0.4 - 0.3, -0.2 - 0.1, 0.02, 0.0, 0.0, 0.0, 0.05, -0.05, 0.03, -math.sin(0.1), 0.0],
+            # 0.2 m behind the right sole, 0.1 m right of it; 3 cm too low; tipped by 0.3, turned by 0.2; the left sole
+            [-0.2, -0.1, -0.03, -math.sin(0.3), 0.0, 0.2, 0.1, -0.2, -0.01, 0.0, 0.0],
+        ]
+    )
+    torch.testing.assert_close(error, expected, atol=1e-6, rtol=0)
+    # the pelvis rolls at 0.1 and pitches at 0.2: its view of the vertical moves by (-pitch, roll)
+    rates = torch.tensor(
+        [
+            [0.6 - 0.5, -0.1, 0.05 - 0.02, -0.2, 0.1, 0.5 - 0.4, 0.1, 0.2, 0.3, 0.0, 0.0],
+            [0.4, 0.2, -0.1, 0.0, 0.0, -0.3, 0.4, 0.5, 0.6, 0.0, 0.0],
+        ]
+    )
+    torch.testing.assert_close(rate, rates, atol=1e-6, rtol=0)
+
+
+def test_every_reward_term_is_what_its_weight_says() -> None:
+    spec = SPEC.model_copy(update={"reward": RewardSpec(torso=2.0)})
+    env = LocomotionEnv(spec, lanes(), threads=1)
+    robots, decay = env.robots, env.clf.decay
+    env.value[:], env._slope[:] = 0.75, -0.75 * decay + 0.3  # V falls too slowly by 0.3 in a second
+    env.command[:] = torch.tensor([0.6, 0.2, 0.5])
+    env.average[:] = torch.tensor([0.44, 0.08, 0.3])  # 0.2 m/s and 0.2 rad/s off
+    robots.orientation = rotation(1, torch.tensor(0.2)).expand(8, 3, 3)
+    robots.torso_rotation = rotation(0, torch.tensor(0.1)).expand(8, 3, 3)
+    robots.torque = torch.full((8, 15), 10.0)
+    robots.touch = torch.zeros_like(robots.touch)
+    shins = [robots.touch_names.index(f"{side}_knee_link") for side in ("left", "right")]
+    robots.touch[:, [*robots.feet, *shins]] = True
+    env.control.action = torch.full((8, 15), 0.5)
+    env._last["action"] = torch.full((8, 15), 0.2)
+    turning = math.exp(-((0.2 / 0.4) ** 2))
+    expected = {
+        "clf": 1.0 * (math.exp(-0.75 / 1.5) + 1 / (2 * 1.75)),
+        "decrease": -0.2 * 0.3 / 1.5,
+        "velocity": 2.0 * math.exp(-1.0) * turning,
+        "velocity_linear": -0.6 * 0.2,
+        "yaw": 0.6 * turning,
+        "upright": -1.5 * math.sin(0.2) ** 2,
+        "torso": -2.0 * math.sin(0.1) ** 2,
+        "action": -0.01 * 15 * 0.5**2,
+        "action_rate": -0.01 * 15 * 0.3**2,
+        "torque": -4e-6 * 15 * 10.0**2,
+        "collision": -0.3 * 2,  # both shins; feet are for standing on
+        "alive": 0.5,
+    }
+    assert env.rewards().keys() == expected.keys()
+    for name, term in env.rewards().items():
+        assert term.tolist() == pytest.approx([expected[name]] * 8, rel=1e-4), name
+    env._slope[:] = -0.75 * decay - 0.3
+    assert (env.rewards()["decrease"] == 0.0).all(), "a V that falls fast enough costs nothing"
 
 
 def test_spinning_on_the_spot_earns_less_than_walking() -> None:
