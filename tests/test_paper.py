@@ -12,19 +12,9 @@ from romnav.evaluation.episodes import load
 from romnav.evaluation.spec import HORIZONS
 from romnav.experiment.project import Project
 from romnav.experiment.workspace import Workspace
+from tests.navigation.test_rewards import PAPER
 
 ROOT = Path(__file__).parents[1]
-REWARDS = {  # Table I
-    "position": 0.2,
-    "heading": 0.2,
-    "height": 0.2,
-    "stand": 0.2,
-    "geodesic_progress": 0.1,
-    "height_progress": 0.1,
-    "collision": -1.0,
-    "action_rate": (-0.01, -0.1),
-    "gate": 2.0,
-}
 STATED: dict[str, Any] = {
     # Sec. III-A
     "pretrain.images": 2_000_000,
@@ -53,7 +43,9 @@ STATED: dict[str, Any] = {
     "navigation.env.sampler.stair_probability": 0.3,
     "navigation.env.sampler.max_distance": 30.0,
     "navigation.env.sampler.cap": "geodesic",
-    **{f"navigation.env.reward.{term}": weight for term, weight in REWARDS.items()},
+    **{f"navigation.env.reward.{term}": weight for term, weight in PAPER.items()},
+    "navigation.env.reward.action_rate": (-0.01, -0.1),
+    "navigation.env.reward.gate": 2.0,
     # Sec. III-E
     "safety.filter.filter.alpha": 0.75,
     "safety.filter.occupancy.cell": 0.05,

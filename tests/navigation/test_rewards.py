@@ -12,6 +12,18 @@ from romnav.navigation.spec import RewardSpec
 
 PERIOD = 0.2
 
+PAPER = {
+    "position": 0.2,
+    "heading": 0.2,
+    "height": 0.2,
+    "stand": 0.2,
+    "geodesic_progress": 0.1,
+    "height_progress": 0.1,
+    "collision": -1.0,
+    "action_rate": -0.01,
+}
+"""Weights of Table I, before the switch."""
+
 
 def value(name: str, spec: RewardSpec | None = None, **changes: object) -> float:
     """One term of a robot that stands far off, touches nothing and makes no progress, but for ``changes``."""
@@ -31,18 +43,8 @@ def value(name: str, spec: RewardSpec | None = None, **changes: object) -> float
 
 
 def test_table_weights() -> None:
-    paper = {
-        "position": 0.2,
-        "heading": 0.2,
-        "height": 0.2,
-        "stand": 0.2,
-        "geodesic_progress": 0.1,
-        "height_progress": 0.1,
-        "collision": -1.0,
-        "action_rate": -0.01,
-    }
-    assert weights(RewardSpec(scale=1.0), 0.0) == paper
-    assert set(paper) == set(TERMS)
+    assert weights(RewardSpec(scale=1.0), 0.0) == PAPER
+    assert set(PAPER) == set(TERMS)
 
 
 @pytest.mark.parametrize(("done", "expected"), [(0.0, -0.01), (0.4999, -0.01), (0.5, -0.1), (1.0, -0.1)])
